@@ -37,6 +37,7 @@ from smp_motor_ident.result import UNITS, Estimate, to_json
 
 if TYPE_CHECKING:
     from smp_motor_ident.report.tuning_page import Tuning
+    from smp_motor_ident.tune import Loop
 
 COMPILED = Path(likelihood.__file__).parent / "__pycache__"
 """Where numba keeps what it has compiled, unless NUMBA_CACHE_DIR says otherwise."""
@@ -187,15 +188,23 @@ def _tunings(outcomes: Mapping[str, Outcome], say: Callable[..., None]) -> dict[
     from smp_motor_ident.report import tuning_page
 
     usual = tune.parser().parse_args(["identification"])
-
-    def one(found: Estimate, _: Callable[[str], None]) -> Tuning:
-        try:
-            return tuning_page.tuning_of(found, tuning.loop_for(found, usual))
-        except ParameterError as error:  # of a motor whose supply is not known
-            return tuning_page.Tuning(found.wheel, reason=str(error))
-
     known = {wheel: out.estimate for wheel, out in outcomes.items() if out.estimate}
-    return workers.in_parallel({wheel: partial(one, found) for wheel, found in known.items()}, say)
+    loops: dict[str, Loop] = {}
+    unknown: dict[str, Tuning] = {}
+    say("designing for the tuning page, which takes some 20 s")
+    for wheel, found in known.items():
+        try:
+            loop = tuning.loop_for(found, usual)
+            loops |= tuning.choose_sources({wheel: found}, {wheel: loop}, {})[0]
+        except SmpError as error:  # such as of a motor whose supply is not known
+            unknown[wheel] = tuning_page.Tuning(wheel, reason=str(error))
+
+    def side_by_side(jobs: Mapping[str, Callable[[], Tuning]]) -> dict[str, Tuning]:
+        each = {wheel: lambda _, job=job: job() for wheel, job in jobs.items()}
+        return workers.in_parallel(each, say, "designing for")
+
+    usable = {wheel: known[wheel] for wheel in loops}
+    return {**unknown, **tuning_page.tunings_of(usable, loops, side_by_side)}
 
 
 def _contents(

@@ -110,7 +110,7 @@ def _design(
     with frame.progress("tune") as say:
         if arguments.speed_source == "auto":
             say("comparing the sources of speed")
-            loops, reasons["speed_sources"] = _choose_sources(estimates, loops, targets)
+            loops, reasons["speed_sources"] = choose_sources(estimates, loops, targets)
         if arguments.compare:
             say("comparing the methods")
             method = _compare(estimates, loops, targets)
@@ -146,7 +146,7 @@ def _write(
     print(f"written: {files[0]}, beside it {files[1].name} and {files[2].name}")
 
 
-def _choose_sources(
+def choose_sources(
     estimates: Mapping[str, Estimate], loops: Mapping[str, Loop], targets: Mapping[str, Any]
 ) -> tuple[dict[str, Loop], list[str]]:
     """Return the loops with the speed source of each wheel, and a line of reasons for each."""
@@ -285,6 +285,7 @@ def show(wheels: WheelSet) -> None:
         print(f"  {wheel:16s} {row(design)}")
     print(wheels.reason)
     for wheel, design in wheels.designs.items():
+        print(f"{wheel}: {design.settling.describe()}")
         print(f"{wheel}: {design.reason}")
         for warning in design.warnings:
             print(f"{wheel}: warning: {warning}")
@@ -302,6 +303,6 @@ def provenance(
     for wheel, design in wheels.designs.items():
         sources = ", ".join(estimates[wheel].sources) or "unknown"
         lines.append(f"{wheel}: {estimates[wheel].model} model from {sources}")
-        lines.append(f"  {design.reason}")
+        lines += [f"  {design.reason}", f"  {design.settling.describe()}"]
         lines.extend(f"  warning: {warning}" for warning in design.warnings)
     return lines

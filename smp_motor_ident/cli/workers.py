@@ -18,12 +18,14 @@ _LIBC, _PR_SET_PDEATHSIG = ctypes.CDLL(None), 1
 _JOBS: dict[str, Callable[[Say], Any]] = {}
 
 
-def in_parallel(jobs: Mapping[str, Callable[[Say], Result]], say: Say) -> dict[str, Result]:
+def in_parallel(
+    jobs: Mapping[str, Callable[[Say], Result]], say: Say, doing: str = "estimating"
+) -> dict[str, Result]:
     """Do every job, each in a process that is forked and so has what is loaded already."""
     cores = min(len(os.sched_getaffinity(0)), len(jobs))
     if cores < 2:
         return {n: job(lambda text, n=n: say(f"{n}: {text}")) for n, job in jobs.items()}
-    say(f"estimating {', '.join(jobs)}")
+    say(f"{doing} {', '.join(jobs)}")
     _JOBS.update(jobs)
     fork = multiprocessing.get_context("fork")
     pool = ProcessPoolExecutor(cores, mp_context=fork, initializer=end_with_parent)
@@ -33,7 +35,7 @@ def in_parallel(jobs: Mapping[str, Callable[[Say], Result]], say: Say) -> dict[s
         for future in as_completed(futures):
             done[futures[future]] = future.result()
             left = [name for name in jobs if name not in done]
-            say(f"estimating {', '.join(left)}", len(done) / len(jobs))
+            say(f"{doing} {', '.join(left)}", len(done) / len(jobs))
         return {name: done[name] for name in jobs}
     except BrokenProcessPool:
         raise BagError("a worker process was ended from outside, perhaps for its memory") from None

@@ -103,6 +103,9 @@ def _drive(
     ):
         designed = (_figure(scale, e["specification"][name]["high"]) for e in entries)
         yield Row(f"{title}, designed at most", unit, tuple(designed))
+        if name == "settling":
+            planned = (_figure(scale, e["settling"]["transition"]) for e in entries)
+            yield Row("Planned transition, included", unit, tuple(planned))
         if all(driven):
             for key, of in (("allowed", "allowed in the drive"), ("reading", "driven")):
                 most = ([one[key][name] for one in changes] for changes in driven)

@@ -129,12 +129,18 @@ def motors_yaml(estimates: Mapping[str, Estimate], provenance: Iterable[str] = (
 
 
 def check_free(paths: Iterable[Path], force: bool) -> None:
-    """Refuse to overwrite."""
+    """Refuse to overwrite, and folders that cannot be written, before anything is computed."""
     for path in paths:
         if path.is_dir():
             raise ParameterError(f"{path}: is a folder, not a file; choose another --output")
         if path.exists() and not force:
             raise ParameterError(f"{path}: exists already; use --force to replace it")
+        there = next(p for p in path.absolute().parents if p.exists())
+        try:
+            with tempfile.TemporaryDirectory(dir=there, prefix=".writing-"):
+                pass
+        except OSError as error:
+            raise ParameterError(f"{path.parent}: cannot be written ({error.strerror})") from None
 
 
 def write_together(files: Mapping[Path, str | bytes], force: bool = False) -> None:

@@ -3,8 +3,9 @@
 Nothing of control is computed in the page; its sliders choose among these designs.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -14,16 +15,37 @@ from smp_motor_ident.errors import SmpError
 from smp_motor_ident.report import drawing, words
 from smp_motor_ident.report.chart import Chart, Curve
 from smp_motor_ident.result import Estimate
-from smp_motor_ident.tune import METHODS, Design, Loop, design, specification, writing
+from smp_motor_ident.tune import (
+    METHODS,
+    Design,
+    Loop,
+    design,
+    design_wheels,
+    specification,
+    writing,
+)
+from smp_motor_ident.tune.case import prepare, solve
 from smp_motor_ident.tune.curves import Curves, curves
+from smp_motor_ident.tune.designer import finish
+from smp_motor_ident.tune.wheels import at_pace_of
 
 SHARES = (0.3, 0.45, 0.65, 0.85, 1.0)
 """Of the bandwidth that the method chooses by itself, which is the largest integral gain's."""
 
 MARGINS = (45.0, 60.0, 70.0)  # phase margins that are offered [deg]: lively, usual, calm
+USUAL = 60.0  # what `tune` takes [deg]
 LIMIT = METHODS["margin"].required.sensitivity
 
 SAMPLES = 100  # motors that the bands of a choice are over: their ends are the least and largest
+
+
+Parallel = Callable[[Mapping[str, Callable[[], "Tuning"]]], Mapping[str, "Tuning"]]
+"""What does jobs by name, side by side or not."""
+
+
+def one_by_one(jobs: Mapping[str, Callable[[], "Tuning"]]) -> Mapping[str, "Tuning"]:
+    """Do jobs one after the other."""
+    return {name: job() for name, job in jobs.items()}
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,28 +70,53 @@ class Tuning:
     reason: str = ""  # why there is no design at all
 
 
-def tuning_of(estimate: Estimate, loop: Loop) -> Tuning:
-    """Design one wheel's controller at every place of the sliders."""
-    try:
-        own = design(estimate, loop, samples=SAMPLES)
-    except SmpError as error:
-        return Tuning(estimate.wheel, reason=str(error))
-    choices = []
-    for margin in MARGINS:
-        for share in SHARES:
-            bandwidth = share * own.margins.crossover
-            usual = share == 1.0 and margin == 60.0
-            choices.append(_choice(estimate, loop, bandwidth, margin, own if usual else None))
-    chosen = MARGINS.index(60.0) * len(SHARES) + len(SHARES) - 1
-    return Tuning(estimate.wheel, choices, chosen)
+def tunings_of(
+    estimates: Mapping[str, Estimate], loops: Mapping[str, Loop], each: Parallel = one_by_one
+) -> dict[str, Tuning]:
+    """Design every wheel's controller at every place of the sliders, at the pace of all wheels.
+
+    What is chosen at first are the designs of ``tune``.
+    """
+    refused: dict[str, Tuning] = {}
+    while left := {w: one for w, one in estimates.items() if w not in refused}:
+        try:
+            own = design_wheels(left, loops).designs
+        except SmpError as error:
+            refused |= _refused(left, loops) or {w: Tuning(w, reason=str(error)) for w in left}
+            continue
+        jobs = {w: partial(_tuning, one, loops[w], own[w]) for w, one in left.items()}
+        return {**refused, **each(jobs)}
+    return refused
 
 
-def _choice(
-    estimate: Estimate, loop: Loop, bandwidth: float, margin: float, made: Design | None
-) -> Choice:
+def _refused(estimates: Mapping[str, Estimate], loops: Mapping[str, Loop]) -> dict[str, Tuning]:
+    """Return the wheels for which there is no design at all, with the reason."""
+    found = {}
+    for wheel, estimate in estimates.items():
+        try:
+            design(estimate, loops[wheel])
+        except SmpError as error:
+            found[wheel] = Tuning(wheel, reason=str(error))
+    return found
+
+
+def _tuning(estimate: Estimate, loop: Loop, own: Design) -> Tuning:
+    choices = [
+        Choice(share * own.margins.crossover, margin, own, curves(estimate, own))
+        if share == SHARES[-1] and margin == USUAL
+        else _choice(estimate, loop, share * own.margins.crossover, margin, own)
+        for margin in MARGINS
+        for share in SHARES
+    ]
+    return Tuning(estimate.wheel, choices, MARGINS.index(USUAL) * len(SHARES) + len(SHARES) - 1)
+
+
+def _choice(estimate: Estimate, loop: Loop, bandwidth: float, margin: float, own: Design) -> Choice:
+    asked: dict[str, Any] = dict(bandwidth=bandwidth, phase_margin=margin, samples=SAMPLES)
     try:
-        asked: dict[str, Any] = dict(bandwidth=bandwidth, phase_margin=margin, samples=SAMPLES)
-        found = made or design(estimate, loop, **asked)
+        case = prepare(estimate, loop, "margin", {**asked, "together": own.together})
+        found = finish(case, *solve(case))
+        found = at_pace_of(own, case, found) if own.together else found
     except SmpError as error:
         return Choice(bandwidth, margin, reason=str(error))
     return Choice(bandwidth, margin, found, curves(estimate, found))
@@ -123,14 +170,20 @@ def _document(one: Choice) -> dict[str, Any]:
 
 def _rows(found: Design) -> list[tuple[str, str, str]]:
     """Return name, value and band of what the design keeps."""
-    bands, gains = found.specification, found.gains
+    bands, gains, settling = found.specification, found.gains, found.settling
     return [
         ("Crossover", f"{found.margins.crossover:.4g} rad/s", ""),
         ("Phase margin", *_banded(bands.phase_margin, 1.0, "°")),
         ("Gain margin", *_banded(bands.gain_margin, 1.0, "")),
         ("Largest sensitivity Ms", *_banded(bands.sensitivity, 1.0, "")),
         ("Overshoot", *_banded(bands.overshoot, 1.0, " %")),
-        ("Settling to 2 %", *_banded(bands.settling, 1e3, " ms")),
+        ("Settling to 2 %, planned transition included", *_banded(bands.settling, 1e3, " ms")),
+        (
+            f"Planned transition of {settling.change:.3g} rad/s",
+            f"{1e3 * settling.transition:.3g} ms",
+            "common to all wheels" if settling.common else "",
+        ),
+        ("Settling of an abrupt change, feedback alone", f"{1e3 * settling.abrupt:.3g} ms", ""),
         ("Control noise", f"{1e3 * found.performance.control_noise:.3g} mV", ""),
         ("p, i, d", f"{gains.p:.4g}, {gains.i:.4g}, {gains.d:.4g}", "V per wheel rad/s"),
     ]

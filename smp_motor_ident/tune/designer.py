@@ -15,7 +15,7 @@ from smp_motor_ident.result import Estimate
 from smp_motor_ident.tune.case import COMMON, Case, prepare, solve
 from smp_motor_ident.tune.ensemble import Robustness
 from smp_motor_ident.tune.feedback import Feedback
-from smp_motor_ident.tune.limits import AS_GOOD, DELAY_BORNE, HELD_BACK
+from smp_motor_ident.tune.limits import AS_GOOD, DELAY_BORNE, HELD_BACK, SETTLED
 from smp_motor_ident.tune.loop import Loop
 from smp_motor_ident.tune.margins import Margins, loop_margins
 from smp_motor_ident.tune.methods import METHODS
@@ -23,7 +23,7 @@ from smp_motor_ident.tune.motors import Motors, lag_in_sensor
 from smp_motor_ident.tune.plant import Plant, sample
 from smp_motor_ident.tune.reference import Reference, controller_for, plan_reference
 from smp_motor_ident.tune.simulation import Controller
-from smp_motor_ident.tune.specification import Performance, Specification, figures_of
+from smp_motor_ident.tune.specification import Performance, Settling, Specification, figures_of
 from smp_motor_ident.tune.unmodelled import UnmodelledDynamics
 from smp_motor_ident.tune.unmodelled import words as known_words
 
@@ -47,11 +47,26 @@ class Design:
     findings: tuple[Finding, ...] = ()  # what the user should know beside
     feedback: Feedback = field(default_factory=lambda: Feedback(0.0, 0.0))
     breakaway: float = 0.0  # command at which the motor must turn [V]
+    together: bool = False  # whether its reference is common to several wheels
 
     @property
     def wheel_reference(self) -> Reference:
         """The reference at the wheel."""
         return self.reference.at_wheel(self.loop.gear_ratio)
+
+    @property
+    def settling(self) -> Settling:
+        """When a change of set-point has settled, and what that includes."""
+        bands = self.specification
+        return Settling(
+            value=bands.settling.value,
+            high=bands.settling.high,
+            tolerance=SETTLED.value,
+            change=bands.change / self.loop.gear_ratio,
+            transition=self.reference.duration(bands.change, self.loop.sample_time),
+            common=self.together,
+            abrupt=self.performance.step_settling,
+        )
 
     @property
     def warnings(self) -> tuple[str, ...]:
@@ -127,6 +142,7 @@ def finish(case: Case, feedback: Feedback, factor: float, robustness: Robustness
         findings=findings,
         feedback=feedback,
         breakaway=case.breakaway,
+        together=bool(problem.targets.get("together")),
     )
 
 

@@ -62,6 +62,12 @@ class Reference:
             drive=replace(self.drive, top_speed=self.drive.top_speed / gear_ratio),
         )
 
+    def duration(self, change: float, sample_time: float) -> float:
+        """Return how long a change of set-point from rest is planned to take [s]."""
+        profile = self.profile()
+        profile.set_target(change, sample_time)
+        return profile.duration
+
     def profile(self) -> Profile:
         """Return the reference as the running loop leads it, at rest at zero."""
         limits = ProfileLimits(acceleration=self.max_acceleration)

@@ -28,7 +28,7 @@ from smp_motor_ident.diagnosis.response_limits import RESONANCE_DAMPING
 from smp_motor_ident.tune.feedback import Feedback
 from smp_motor_ident.tune.limits import RESONANCE_DAMPED, SETTLED
 from smp_motor_ident.tune.plant import Plant
-from smp_motor_ident.tune.simulation import settled
+from smp_motor_ident.tune.simulation import settling_time
 from smp_motor_ident.tune.unmodelled import UnmodelledDynamics
 
 COUNT = 40
@@ -61,14 +61,14 @@ def added_by_resonance(
     time = T * np.arange(n, dtype=np.float64)
     omega = np.asarray(2 * np.pi * np.fft.rfftfreq(n, T)[1:], dtype=np.float64)
     complementary, moved = _loop(plant, feedback, omega, usual)
-    ends, highest = [_settled(time, usual)], usual.max()
+    ends, highest = [settling_time(time, usual)], usual.max()
     for damping in DAMPINGS:
         error = mode(omega, at, damping, T) * largest(unmodelled, at, damping, T)[:, None]
         for D in (error, -error):
             spectrum = np.pad(D * moved / (1 + D * complementary), ((0, 0), (1, 0)))
             rows = usual + np.fft.irfft(spectrum, n)
             highest = max(highest, rows.max())
-            ends += [_settled(time, row) for row in rows]
+            ends += [settling_time(time, row) for row in rows]
     return float(highest - usual.max()), float(np.max(ends) - ends[0])
 
 
@@ -101,7 +101,3 @@ def _loop(plant: Plant, feedback: Feedback, omega: Array, answer: Array) -> tupl
     spectrum = np.fft.rfft(np.diff(answer, prepend=0.0))[1:] / (1 - 1 / z)
     whole = 1 + control * response
     return control * through / whole, own / whole * spectrum
-
-
-def _settled(time: Array, answer: Array) -> float:
-    return settled(time, np.abs(answer - 1) > SETTLED.value)

@@ -16,6 +16,7 @@ from smp_motor_control.observer import DISAGREE, INNOVATION_MEMORY
 from smp_motor_ident._compile import compiled
 from smp_motor_ident.model.driver import Driver, terminal_voltage
 from smp_motor_ident.tune.feedback import Feedback
+from smp_motor_ident.tune.limits import SETTLED
 from smp_motor_ident.tune.observer_model import NO_OBSERVER, SPEED
 from smp_motor_ident.tune.plant import Plant
 
@@ -267,6 +268,11 @@ def settled(time: Array, outside: NDArray[np.bool_]) -> float:
     return float(time[last + 1]) if last + 1 < time.size else math.nan
 
 
+def settling_time(time: Array, answer: Array, tolerance: float = SETTLED.value) -> float:
+    """Return when the answer to a unit change stays within a tolerance of 1; NaN where never."""
+    return settled(time, np.abs(answer - 1.0) > tolerance)
+
+
 def step_figures(time: Array, speed: Array, voltage: Array, final: float) -> StepFigures:
     """Read a step response."""
     relative = speed / final
@@ -274,7 +280,7 @@ def step_figures(time: Array, speed: Array, voltage: Array, final: float) -> Ste
     rose = bool(np.any(relative >= 0.9))
     return StepFigures(
         rise=float(time[high] - time[low]) if rose else math.nan,
-        settling=settled(time, np.abs(relative - 1) > 0.02),
+        settling=settling_time(time, relative),
         overshoot=float(max(100 * (relative.max() - 1), 0.0)),
         peak_voltage=float(np.abs(voltage).max()),
     )

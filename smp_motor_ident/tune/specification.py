@@ -79,6 +79,30 @@ class Specification:
     sensitivity: Band
 
 
+@dataclass(frozen=True)
+class Settling:
+    """When a change of set-point from rest has settled, and what that figure includes."""
+
+    value: float  # of the motor as identified [s]
+    high: float  # 99 % of the motors that the data allow [s]
+    tolerance: float  # band around the set-point [share of the change]
+    change: float  # of the set-point [rad/s, wheel]
+    transition: float  # duration of the planned change, which is in the figures [s]
+    common: bool  # whether that is common to several wheels
+    abrupt: float  # of an abrupt change, by the feedback gains alone [s]
+
+    def describe(self) -> str:
+        """Return it in words."""
+        high = "not stated" if math.isnan(self.high) else f"{1e3 * self.high:.3g} ms"
+        wheels = ", common to all wheels" if self.common else ""
+        return (
+            f"settles within {self.tolerance:.0%} in {1e3 * self.value:.3g} ms (at most {high}) "
+            f"after a change of set-point by {self.change:.3g} rad/s, its planned transition of "
+            f"{1e3 * self.transition:.3g} ms included{wheels}; an abrupt change, by the feedback "
+            f"alone, in {1e3 * self.abrupt:.3g} ms"
+        )
+
+
 DRAWS = 300
 """Motors that the bands of a specification are over, fewer where a change takes many samples."""
 

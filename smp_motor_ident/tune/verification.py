@@ -31,7 +31,7 @@ from smp_motor_ident.tune.limits import (
     SILENCE,
     STEADY_ERROR,
 )
-from smp_motor_ident.tune.simulation import settled
+from smp_motor_ident.tune.simulation import settling_time
 
 SMOOTHING = 0.05
 """Length [s] of the parabola whose slope is taken as the speed."""
@@ -105,7 +105,7 @@ def resolution(quantum: float, step: float) -> float:
 def read(time: Array, speed: Array, setpoint: float, tolerance: float) -> Reading:
     """Read a change from rest at time zero; ``tolerance`` is a share of the set-point."""
     relative = speed / setpoint
-    settling = settled(time, np.abs(relative - 1.0) > tolerance)
+    settling = settling_time(time, relative, tolerance)
     late = time > time[-1] - STEADY
     return Reading(
         settling=math.inf if math.isnan(settling) else settling,

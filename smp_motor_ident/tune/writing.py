@@ -110,6 +110,6 @@ def _entry(design: Design) -> dict[str, Any]:
 
 _WRITTEN = (
     "method", "reason", "warnings", "gains", "margins", "robustness", "findings", "performance",
-    "specification", "reference", "loop", "motor", "sensor",
+    "specification", "settling", "reference", "loop", "motor", "sensor",
 )  # fmt: skip
 """What of a design stands in ``gains.json``, wheel quantities at the wheel."""

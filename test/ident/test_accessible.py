@@ -41,7 +41,7 @@ def report(monkeypatch: pytest.MonkeyPatch) -> str:
         Report(
             {one.wheel: one, other.wheel: other}, {one.wheel: [compared]},
             {"rear_left": "voltage is constant; excite the motor"}, {"Command": "identify a b"},
-            {one.wheel: tuning_page.tuning_of(one, loop)},
+            tuning_page.tunings_of({one.wheel: one}, {one.wheel: loop}),
         )
     )  # fmt: skip
 

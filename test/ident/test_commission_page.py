@@ -44,6 +44,7 @@ def passed(tmp_path: Path) -> Path:
     (tmp_path / "identification" / "identification.json").write_text(text)
     band = {"value": 0.145, "low": 0.145, "high": 0.15}
     entry = {"gains": GAINS, "specification": {"settling": band, "overshoot": band}}
+    entry["settling"] = {"transition": 0.16}
     (tmp_path / "gains.json").write_text(json.dumps({"wheels": dict.fromkeys(WHEELS, entry)}))
     nodes = {f"/**/{wheel}/wheel_pid": {"ros__parameters": GAINS} for wheel in WHEELS}
     (tmp_path / "gains.yaml").write_text("# designed by tune\n" + yaml.safe_dump(nodes))

@@ -142,6 +142,7 @@ class Steps:
         most = {"value": 0.1, "high": 0.15}
         entry = {"gains": dict.fromkeys((name for name, _ in GAINS), 1.0)}
         entry["specification"] = {"settling": most, "overshoot": most}
+        entry["settling"] = {"transition": 0.16}
         (self.folder / "gains.json").write_text(json.dumps({"wheels": {"left": entry}}))
         (self.folder / "gains.yaml").write_text(GIVEN)
 

@@ -13,10 +13,12 @@ import yaml
 
 from smp_motor_control import WHEELS
 from smp_motor_control.pid import PidGains
-from smp_motor_ident.cli.tune import main
+from smp_motor_ident.cli import tuning
+from smp_motor_ident.cli.tune import main, parser
 from smp_motor_ident.cli.tuning import row
 from smp_motor_ident.record import Hardware
-from smp_motor_ident.report.document import identification_document
+from smp_motor_ident.report import tuning_page
+from smp_motor_ident.report.document import identification_document, read_identification
 from smp_motor_ident.result import Estimate, Quantity
 
 MOTORS = Path(__file__).resolve().parents[2] / "config" / "motors_paper.yaml"
@@ -94,6 +96,56 @@ def test_small_gains_are_shown_with_their_digits():
     )
     assert row(design).split()[:3] == ["0.000149", "0.0015", "0"]
     assert "0.000662" in row(design)
+
+
+@pytest.mark.parametrize("export", [[], ["--export", "wpilib"]])
+def test_a_folder_that_cannot_be_written_is_named_before_anything_is_designed(
+    identified, capsys, monkeypatch, export
+):
+    def design(*_: object, **__: object) -> None:
+        raise AssertionError("designed before looking")
+
+    monkeypatch.setattr(tuning, "design_wheels", design)
+    monkeypatch.setattr(tuning, "export", design)
+    monkeypatch.setattr(tuning, "choose_source", design)
+    output = identified / "identification.json" / "gains.yaml"  # a file is no folder
+    assert main([str(identified), "--output", str(output), *export]) == 2
+    assert "identification.json: cannot be written" in capsys.readouterr().err
+
+
+def test_tune_the_tuning_page_and_the_file_state_one_settling(identified, capsys, monkeypatch):
+    monkeypatch.setattr(tuning_page, "SHARES", (0.6, 1.0))
+    monkeypatch.setattr(tuning_page, "MARGINS", (60.0,))
+    estimates = read_identification(identified)
+    fast = replace(estimates["front_right"].combinations["dc_gain"], value=16.8)
+    slower = {**estimates["front_right"].combinations, "dc_gain": fast}
+    estimates["front_right"] = replace(estimates["front_right"], combinations=slower)
+    document = identification_document({w: estimates[w] for w in ("front_left", "front_right")})
+    (identified / "identification.json").write_text(json.dumps(document))
+    assert main([str(identified), "--output", str(identified / "gains.yaml")]) == 0
+    told = capsys.readouterr().out
+    entries = json.loads((identified / "gains.json").read_text())["wheels"]
+
+    estimates = read_identification(identified)
+    usual = parser().parse_args([str(identified)])
+    loops = {w: tuning.loop_for(one, usual) for w, one in estimates.items()}
+    tunings = tuning_page.tunings_of(estimates, tuning.choose_sources(estimates, loops, {})[0])
+    for wheel, shown in tuning_page.page_data(tunings)["wheels"].items():
+        stated = entries[wheel]["settling"]
+        rows = {name: held for name, *held in shown["choices"][-1]["rows"]}
+        settles = f"{1e3 * stated['value']:.3g} ms"
+        assert rows["Settling to 2 %, planned transition included"][0] == settles
+        transition, common = rows[f"Planned transition of {stated['change']:.3g} rad/s"]
+        assert transition == f"{1e3 * stated['transition']:.3g} ms" and "common" in common
+        (line,) = [x for x in told.splitlines() if x.startswith(f"{wheel}: settles")]
+        assert f"in {settles}" in line and f"transition of {transition} included" in line
+        # One transition for all, also where the page asks for less bandwidth: as slow or slower.
+        assert (
+            stated["common"]
+            and stated["transition"] == entries["front_left"]["settling"]["transition"]
+        )
+        softer = tunings[wheel].choices[0].design
+        assert softer.settling.transition >= stated["transition"]
 
 
 def test_nothing_is_overwritten_without_force(identified, capsys):
