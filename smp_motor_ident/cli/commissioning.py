@@ -5,7 +5,6 @@ that is gone on with does the rest at the same voltages, and so ends as one that
 """
 
 import argparse
-import json
 import shutil
 import sys
 from collections.abc import Mapping, Sequence
@@ -18,7 +17,7 @@ from smp_motor_control import WHEELS
 from smp_motor_control.motor.file import load_motors
 from smp_motor_control.wheel.protection import Bounds
 from smp_motor_ident import bag
-from smp_motor_ident.cli import applying, checking, commission, plan, protocol, steps, verifying
+from smp_motor_ident.cli import checking, commission, driving, plan, protocol, steps, verifying
 from smp_motor_ident.cli.processes import ProcessError, Processes, connect
 from smp_motor_ident.cli.protocol import Protocol
 from smp_motor_ident.diagnosis import validation_run, wheel_limits, winding
@@ -218,7 +217,7 @@ def too_hot(folder: Path, earlier: Sequence[plan.Recording], last: plan.Recordin
     return [f for w in now if w in before for f in winding.heated(w, before[w], now[w][0])]
 
 
-def _design(session: Session) -> verifying.Designed:
+def _design(session: Session) -> driving.Designed:
     """Identify and tune, as far as that is not done; what they write appears as a whole."""
     arguments, robot, made = session.arguments, session.robot, session.protocol
     folder, gains = robot.folder, robot.folder / "gains.yaml"
@@ -241,8 +240,7 @@ def _design(session: Session) -> verifying.Designed:
         steps.tune_wheels(folder / "identification", gains, "--force", *accepted)
         made.mark(tuned=True)
         made.write()
-    document = json.loads((folder / "gains.json").read_text("utf-8"))["wheels"]
-    return verifying.Designed(estimates, applying.from_file(gains), document)
+    return driving.designed(estimates, gains)
 
 
 def _identify(session: Session, part: str) -> dict[str, Estimate]:
@@ -266,11 +264,13 @@ def _identify(session: Session, part: str) -> dict[str, Estimate]:
     return estimates
 
 
-def _verify(session: Session, designed: verifying.Designed) -> str:
+def _verify(session: Session, designed: driving.Designed) -> str:
     """Drive with the gains on trial, judge the drive, and return what became of them."""
     robot, made = session.robot, session.protocol
     robot.client.refuse_second_reporters(robot.wheels)
-    session.schedule.add(plan.DRIVING, "drive", plan.START + sum(one[2] for one in designed.plan()))
+    session.schedule.add(
+        plan.DRIVING, "drive", plan.START + sum(one[2] for one in verifying.plan_of(designed))
+    )
     session.begin(plan.DRIVING)
     own = robot.uncontrolled()
     try:

@@ -11,11 +11,10 @@ from typing import Any
 
 from smp_motor_control import LEFT, RIGHT, WHEELS, controller_of
 from smp_motor_control.motor.file import load_motors, paper_motors
-from smp_motor_ident.cli import applying, demo, driving, steps, verdict
+from smp_motor_ident.cli import demo, driving, plan, steps, verdict
 from smp_motor_ident.cli.processes import Processes, connect, free_domain
 from smp_motor_ident.cli.workers import die_with_parent
 from smp_motor_ident.errors import ParameterError
-from smp_motor_ident.result import Estimate
 
 PLAN = (
     steps.Excitation("sine", 8.0, 10.0),
@@ -56,16 +55,19 @@ def work(arguments: argparse.Namespace) -> int:
     with Processes(folder / "logs") as processes, connect(demo.NAME) as client:
         robot = start(steps.Robot(processes, client, WHEELS, folder), motors, arguments.rate)
         say(f"running: motor_plant, {len(WHEELS)} wheel_pid, skid_steer (ROS domain {domain})")
-        estimates, gains = learn(robot, say)
-        driven, segments, stall = drive(robot, gains, say)
-    hardware = {wheel: estimates[wheel].hardware for wheel in WHEELS}
-    answers = driving.answers_of(driven, segments, hardware)
+        designed = learn(robot, say)
+        driven, segments, stall = drive(robot, designed.gains, say)
+    hardware = {wheel: designed.estimates[wheel].hardware for wheel in WHEELS}
     figure = driving.drive_figure(driven, {"left": LEFT, "right": RIGHT}, hardware)
     (folder / "drive.svg").write_text(figure, encoding="utf-8")
-    verdict.show(truth, estimates, gains, answers)
-    checks = verdict.check_estimates(truth, estimates)
+    changes = {
+        w: driving.changes_of(w, one, driving.moves_in(segments, one.answers), designed)[0]
+        for w, one in driven.items()
+    }
+    verdict.show(truth, designed, changes)
+    checks = verdict.check_estimates(truth, designed.estimates)
     if stall <= STALL:
-        checks += verdict.check_drive(answers)
+        checks += verdict.check_drive(changes)
     else:
         print(f"---- the drive is not judged: this machine stood still for {1e3 * stall:.0f} ms")
     for one in checks:
@@ -97,30 +99,33 @@ def start(robot: steps.Robot, motors: Path, rate: float) -> steps.Robot:
     return robot
 
 
-def learn(robot: steps.Robot, say: Any) -> tuple[dict[str, Estimate], dict[str, dict[str, Any]]]:
+def learn(robot: steps.Robot, say: Any) -> driving.Designed:
     """Excite, record, identify and tune."""
     bag = steps.record(robot, "excitation")
     for part in PLAN:
         say(f"exciting all wheels: {part.signal}, {part.amplitude:g} V, {part.duration:g} s")
         steps.excite(robot, [part])
     robot.processes.stop("record")
-    say(f"recorded {bag}; identifying")
+    takes = plan.words(plan.COMPUTE * len(robot.wheels))
+    say(f"recorded {bag}; identifying, which takes about {takes}")
     results = robot.folder / "identification"
     estimates = steps.identify_wheels(bag, results, "--quiet")
-    say("tuning")
-    steps.tune_wheels(results, robot.folder / "gains.yaml")
-    return estimates, applying.from_file(robot.folder / "gains.yaml")
+    say(f"tuning, which takes about {takes}")
+    gains = robot.folder / "gains.yaml"
+    steps.tune_wheels(results, gains)
+    return driving.designed(estimates, gains)
 
 
 def drive(
     robot: steps.Robot, gains: Mapping[str, Mapping[str, Any]], say: Any
-) -> tuple[driving.Drive, list[tuple[str, float, float]], float]:
+) -> tuple[dict[str, driving.Driven], list[tuple[str, float, float]], float]:
     """Drive through :data:`DRIVE` with the gains; return recording, segments and stall [s]."""
     from smp_motor_control.nodes.driving import drive_body
 
     robot.client.set_parameters({controller_of(w): new for w, new in gains.items()})
     robot.switch("activate")
-    say("gains set in the running controllers; driving")
+    lasts = plan.words(sum(seconds for *_, seconds in DRIVE))
+    say(f"gains set in the running controllers; driving for {lasts}")
     drives = []
     for attempt in range(1, ATTEMPTS + 1):
         name = "drive" if attempt == 1 else f"drive_{attempt}"

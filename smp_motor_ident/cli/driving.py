@@ -1,8 +1,10 @@
-"""How the wheels answered ``cmd_vel``, from the recording of a drive."""
+"""A recorded drive: the changes of set-point of its wheels, measured and predicted."""
 
+import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -11,60 +13,140 @@ from smp_motor_control.encoder import unwrap
 from smp_motor_control.motor.parameters import Gearbox
 from smp_motor_ident.bag.decode import read_columns
 from smp_motor_ident.bag.storage import Table
+from smp_motor_ident.cli import applying
 from smp_motor_ident.record import Hardware
 from smp_motor_ident.report.chart import Chart, Curve
 from smp_motor_ident.report.drawing import document
-from smp_motor_ident.tune.simulation import StepFigures, step_figures
-from smp_motor_ident.tune.verification import smoothed
+from smp_motor_ident.result import Estimate
+from smp_motor_ident.tune import verification
+from smp_motor_ident.tune.verification import Change
 
 LEAST_CHANGE = 0.8  # a smaller change of the set-point [rad/s, wheel] is no step to judge
+LEAD = 0.3  # rest before a drive that is simulated with it [s]
+STATE = ("encoder_count", "position", "voltage")
+ANSWER = ("setpoint", "age", "dt", "output")
 
 
 @dataclass(frozen=True)
-class Answer:
-    """One wheel's answer to one change of ``cmd_vel``."""
+class Designed:
+    """What a drive is judged by, by wheel."""
 
-    segment: str  # name of the manoeuvre that began
-    # before, after: speed before, and set-point [rad/s, wheel]
-    before: float
-    after: float
-    figures: StepFigures  # of the change
+    estimates: Mapping[str, Estimate]  # the motors
+    gains: Mapping[str, Mapping[str, Any]]  # parameters of ``wheel_pid``, as in ``gains.yaml``
+    document: Mapping[str, Mapping[str, Any]]  # as in ``gains.json``
 
 
-Drive = Mapping[str, Table]
-"""What is judged and drawn of the recording of a drive, by topic."""
+def designed(estimates: Mapping[str, Estimate], gains: Path) -> Designed:
+    """Return motors with the gains that ``tune`` wrote for them, a YAML file and its JSON."""
+    document = json.loads(gains.with_suffix(".json").read_text("utf-8"))["wheels"]
+    return Designed(estimates, applying.from_file(gains), document)
 
 
-def read_drive(bag: Path, wheels: Sequence[str]) -> Drive:
+@dataclass(frozen=True)
+class Driven:
+    """What was recorded of one wheel: its samples, and the answers of its controller."""
+
+    state: Table
+    answers: Table
+
+
+@dataclass(frozen=True)
+class Move:
+    """One change of set-point in a drive."""
+
+    name: str
+    begin: float  # when the wheel was first heard at the new set-point [s]
+    before: float  # set-point until then [rad/s, wheel]
+    setpoint: float  # [rad/s, wheel]
+    lasts: float  # [s]
+
+
+def read_drive(bag: Path, wheels: Sequence[str], namespace: str = "") -> dict[str, Driven]:
     """Read the samples of wheels and the answers of their controllers."""
-    wanted = {f"/{wheel}/motor_state": ["encoder_count"] for wheel in wheels}
-    return read_columns(bag, wanted | {f"/{w}/pid_state": ["setpoint", "age"] for w in wheels})
+    wanted = {f"{namespace}/{wheel}/motor_state": list(STATE) for wheel in wheels}
+    wanted |= {f"{namespace}/{wheel}/pid_state": list(ANSWER) for wheel in wheels}
+    read = read_columns(bag, wanted)
+    return {
+        w: Driven(read[f"{namespace}/{w}/motor_state"], read[f"{namespace}/{w}/pid_state"])
+        for w in wheels
+    }
 
 
-def answers_of(
-    drive: Drive, segments: Sequence[tuple[str, float, float]], hardware: Mapping[str, Hardware]
-) -> dict[str, list[Answer]]:
-    """Measure rise, settling and overshoot of every wheel in every segment."""
-    answers = {}
-    for wheel, known in hardware.items():
-        time, speed = wheel_speed(drive[f"/{wheel}/motor_state"], known)
-        asked = drive[f"/{wheel}/pid_state"]
-        found = [_answer(time, speed, asked, *segment) for segment in segments]
-        answers[wheel] = [a for a in found if a is not None]
-    return answers
+def moves_in(segments: Sequence[tuple[str, float, float]], answers: Table) -> list[Move]:
+    """Return the changes of one wheel's set-point in a drive by segments of name, begin and end."""
+    seconds, asked = answers.seconds, answers.columns["setpoint"]
+    moves = []
+    for name, begin, end in segments:
+        during = np.flatnonzero((seconds > begin) & (seconds < end))
+        if during.size == 0:
+            continue
+        final = asked[during[-1]]
+        first = during[np.argmax(asked[during] == final)]
+        before = float(asked[max(first - 1, 0)])
+        if abs(final - before) >= LEAST_CHANGE:
+            at = float(seconds[first])
+            moves.append(Move(name, at, before, float(final), end - at))
+    return moves
+
+
+def changes_of(
+    wheel: str, driven: Driven, moves: Sequence[Move], given: Designed
+) -> tuple[list[Change], float]:
+    """Return the changes of one wheel, and its longest wait for an answer [s].
+
+    The prediction is of its whole drive.
+    """
+    state, answers = driven.state, driven.answers
+    estimate, entry = given.estimates[wheel], given.document[wheel]
+    delays = verification.arrival_delays(
+        (answers.seconds, answers.columns["age"], answers.columns["output"]),
+        (state.seconds, state.columns["voltage"]),
+        entry["loop"],
+    )
+    # The first interval is that since another drive.
+    late = answers.columns["dt"][1:], delays[1:]
+    silence = max(float(np.max(one, initial=0.0)) for one in late)
+    end = max((one.begin + one.lasts for one in moves), default=0.0)
+    shown = (state.seconds > answers.seconds[0] - LEAD) & (state.seconds < end)
+    instants = state.seconds[shown]
+    known = dict(zip(answers.seconds, delays))
+    waited = np.array([known.get(instant, np.nan) for instant in instants])
+    latest = np.searchsorted(answers.seconds, instants, side="right") - 1
+    asked = np.where(latest < 0, 0.0, answers.columns["setpoint"][latest])
+    step = float(entry["loop"]["sample_time"])
+    even, speed = verification.smoothed(
+        instants, wheel_angle(state, estimate.hardware)[shown], step
+    )
+    rows = verification.predicted(
+        estimate, given.gains[wheel], entry["loop"], asked, (instants, waited), even
+    )
+    hardware = estimate.hardware
+    count = 2 * np.pi / (hardware.counts_per_revolution or 1e6) / hardware.gear_ratio
+    unsure = verification.resolution(count, step)
+    changes = []
+    for one in moves:
+        since = even - one.begin
+        kept = (since >= 0.0) & (since < one.lasts - 0.05)
+        changes.append(verification.change_of(
+            wheel, one.name, one.setpoint, since[kept], speed[kept], rows[:, kept],
+            entry["specification"], unsure, before=one.before,
+        ))  # fmt: skip
+    return changes, silence
 
 
 def drive_figure(
-    drive: Drive, sides: Mapping[str, Sequence[str]], hardware: Mapping[str, Hardware]
+    drive: Mapping[str, Driven],
+    sides: Mapping[str, Sequence[str]],
+    hardware: Mapping[str, Hardware],
 ) -> str:
     """Return an SVG file: what the wheels of each side were asked for, and what they did."""
     wheels = list(hardware)
-    begin = min(float(columns.seconds[0]) for columns in drive.values())
+    begin = min(float(one.state.seconds[0]) for one in drive.values())
     charts = []
     for side, names in sides.items():
-        asked = drive[f"/{names[0]}/pid_state"]
+        asked = drive[names[0]].answers
         time = asked.seconds
-        speeds = {w: wheel_speed(drive[f"/{w}/motor_state"], hardware[w]) for w in names}
+        speeds = {w: wheel_speed(drive[w].state, hardware[w]) for w in names}
         curves = [Curve("set-point", asked.columns["setpoint"], "muted")]
         curves += [
             Curve(w, np.interp(time, *speeds[w]), f"wheel-{wheels.index(w) % 4 + 1}") for w in names
@@ -77,11 +159,11 @@ def drive_figure(
     return document(charts, wheels)
 
 
-def longest_stall(drive: Drive) -> float:
-    """Return how long the machine that simulates stood still at worst."""
-    gaps = (np.diff(c.seconds) for c in drive.values() if "age" not in c.columns)
-    ages = (c.columns["age"] for c in drive.values() if "age" in c.columns)
-    return max(float(np.max(found)) for found in (*gaps, *ages))
+def longest_stall(drive: Mapping[str, Driven]) -> float:
+    """Return how long the machine that simulates stood still at worst [s]."""
+    gaps = (float(np.max(np.diff(one.state.seconds))) for one in drive.values())
+    ages = (float(np.max(one.answers.columns["age"])) for one in drive.values())
+    return max(*gaps, *ages)
 
 
 def wheel_angle(state: Table, hardware: Hardware) -> Array:
@@ -96,23 +178,5 @@ def wheel_angle(state: Table, hardware: Hardware) -> Array:
 def wheel_speed(state: Table, hardware: Hardware) -> tuple[Array, Array]:
     """Return the wheel's speed as its encoder saw it."""
     angle = wheel_angle(state, hardware)
-    return smoothed(state.seconds, angle - angle[0], float(np.median(np.diff(state.seconds))))
-
-
-def _answer(
-    time: Array, speed: Array, asked: Table, name: str, begin: float, end: float
-) -> Answer | None:
-    """Read one segment; its set-point is the last one asked for in it."""
-    during = np.flatnonzero((asked.seconds > begin) & (asked.seconds < end))
-    before = (time > begin - 0.3) & (time < begin)
-    inside = (time >= begin) & (time < end)
-    if during.size == 0 or not inside.any():
-        return None
-    start = float(speed[before].mean()) if before.any() else 0.0
-    final = float(asked.columns["setpoint"][during[-1]])
-    if abs(final - start) < LEAST_CHANGE:
-        return None
-    figures = step_figures(
-        time[inside] - begin, speed[inside] - start, np.zeros(inside.sum()), final - start
-    )
-    return Answer(name, start, final, figures)
+    step = float(np.median(np.diff(state.seconds)))
+    return verification.smoothed(state.seconds, angle - angle[0], step)

@@ -63,7 +63,7 @@ class Protocol:
         self.document["changes"] = [
             dict(wheel=one.wheel, name=one.name, setpoint=one.setpoint)
             | dict(reading=plain(one.reading), expected=plain(one.expected))
-            | dict(allowed=plain(one.bands))
+            | dict(allowed=plain(one.bands), tolerance=one.tolerance)
             for one in changes
         ]
 

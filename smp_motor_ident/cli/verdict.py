@@ -3,17 +3,17 @@
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 from smp_motor_control.motor.file import MotorEntry
 from smp_motor_control.motor.parameters import COMBINATIONS, PHYSICAL
-from smp_motor_ident.cli.driving import Answer
+from smp_motor_ident.cli.driving import Designed
 from smp_motor_ident.cli.tables import console, table
 from smp_motor_ident.report import words
 from smp_motor_ident.result import Estimate, Quantity
+from smp_motor_ident.tune.verification import Change
 
 MOST_OVERSHOOT = 2.0  # percent of the change
-MOST_SETTLING = 1.0  # s: the manoeuvres take longer
+MOST_LATE = 20.0  # ms behind the prediction: four samples
 MOST_GAIN_ERROR = 0.5  # percent
 MOST_DEVIATIONS = 3.0  # of its own standard deviations, for every parameter of a wheel
 WORST_DEVIATIONS = 4.0
@@ -51,13 +51,12 @@ def _compared(entry: MotorEntry, estimate: Estimate) -> list[tuple[str, float, Q
 
 def show(
     truth: Mapping[str, MotorEntry],
-    estimates: Mapping[str, Estimate],
-    gains: Mapping[str, Mapping[str, Any]],
-    answers: Mapping[str, Sequence[Answer]],
+    designed: Designed,
+    changes: Mapping[str, Sequence[Change]],
 ) -> None:
     """Print one table per wheel."""
     out = console()
-    for wheel, estimate in estimates.items():
+    for wheel, estimate in designed.estimates.items():
         title = f"{words.label(wheel)}: {words.model(estimate.model)}"
         made = table(title, "", "true", "identified", "std", "error/std", "unit")
         made.columns[5].justify = "left"
@@ -72,15 +71,15 @@ def show(
                 f"{error / std:+.1f}" if std else "",
                 quantity.unit,
             )
-        mine = gains[wheel]
+        mine = designed.gains[wheel]
         text = ", ".join(f"{n} {mine[n]:.4g}" for n in GAINS if mine.get(n))
-        driven = table("", "manoeuvre", "from", "to", "rise", "settling", "overshoot")
-        for one in answers[wheel]:
-            figures = one.figures
-            times = (f"{1e3 * seconds:.0f} ms" for seconds in (figures.rise, figures.settling))
-            overshoot = f"{figures.overshoot:.2f} %"
-            speeds = f"{one.before:+.2f}", f"{one.after:+.2f} rad/s"
-            driven.add_row(one.segment, *speeds, *times, overshoot)
+        columns = ("manoeuvre", "to", "settling", "predicted", "overshoot", "predicted")
+        driven = table("", *columns)
+        for one in changes[wheel]:
+            pairs = (one.reading, one.expected)
+            settled = (f"{1e3 * x.settling:.0f} ms" for x in pairs)
+            overshoot = (f"{x.overshoot:.2f} %" for x in pairs)
+            driven.add_row(one.name, f"{one.setpoint:+.2f} rad/s", *settled, *overshoot)
         out.print(made)
         out.print(f"gains (volts, wheel rad/s): {text}", soft_wrap=True)
         out.print(driven)
@@ -109,14 +108,14 @@ def check_estimates(
     ]
 
 
-def check_drive(answers: Mapping[str, Sequence[Answer]]) -> list[Check]:
+def check_drive(changes: Mapping[str, Sequence[Change]]) -> list[Check]:
     """Hold what the wheels did against the limits."""
-    every = [(f"{wheel} {one.segment}", one) for wheel, given in answers.items() for one in given]
-    over = [(one.figures.overshoot, where) for where, one in every]
-    settled = [(one.figures.settling, where) for where, one in every]
+    every = [(f"{wheel} {one.name}", one) for wheel, given in changes.items() for one in given]
+    over = [(one.reading.overshoot, where) for where, one in every]
+    late = [(1e3 * (one.reading.settling - one.expected.settling), where) for where, one in every]
     return [
         _worst("overshoot", over, MOST_OVERSHOOT, "%"),
-        _worst("settling time", settled, MOST_SETTLING, "s"),
+        _worst("settling after its prediction", late, MOST_LATE, "ms"),
     ]
 
 

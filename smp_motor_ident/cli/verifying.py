@@ -10,16 +10,14 @@ from typing import Any
 import numpy as np
 
 from smp_motor_control import controller_of
-from smp_motor_ident.bag.decode import read_columns
 from smp_motor_ident.bag.storage import Table
-from smp_motor_ident.cli import driving, processes, steps
+from smp_motor_ident.cli import processes, steps
+from smp_motor_ident.cli.driving import LEAD, Designed, Move, changes_of, read_drive
 from smp_motor_ident.finding import Finding
-from smp_motor_ident.result import Estimate
 from smp_motor_ident.tune import verification
 from smp_motor_ident.tune.verification import STEADY, Change
 
 LEAST = 1.0  # of a change of set-point with its end [s]
-LEAD = 0.3  # rest before a change that is simulated with it [s]
 ATTEMPTS = 3  # drives; a drive that was disturbed is repeated, whatever it showed
 
 
@@ -50,22 +48,14 @@ def on_trial(client: Any, gains: Mapping[str, Mapping[str, Any]]) -> Iterator[Tr
         client.owe(**owed)
 
 
-@dataclass(frozen=True)
-class Designed:
-    """What a drive is judged by, by wheel."""
-
-    estimates: Mapping[str, Estimate]  # the motors
-    gains: Mapping[str, Mapping[str, Any]]  # parameters of ``wheel_pid``, as in ``gains.yaml``
-    document: Mapping[str, Mapping[str, Any]]  # as in ``gains.json``
-
-    def plan(self) -> list[tuple[str, float, float]]:
-        """Return the steps of the drive: name, set-point [rad/s] and duration [s]."""
-        specified = [one["specification"] for one in self.document.values()]
-        change = min(float(one["change"]) for one in specified)
-        longest = max(float(one["settling"]["high"] or LEAST) for one in specified)
-        lasts = max(LEAST, 2 * longest + STEADY)
-        driven = [("forward", change), ("stop", 0.0), ("reverse", -change), ("stop", 0.0)]
-        return [("stand", 0.0, 2 * LEAD), *((name, speed, lasts) for name, speed in driven)]
+def plan_of(designed: Designed) -> list[tuple[str, float, float]]:
+    """Return the steps of the drive: name, set-point [rad/s] and duration [s]."""
+    specified = [one["specification"] for one in designed.document.values()]
+    change = min(float(one["change"]) for one in specified)
+    longest = max(float(one["settling"]["high"] or LEAST) for one in specified)
+    lasts = max(LEAST, 2 * longest + STEADY)
+    driven = [("forward", change), ("stop", 0.0), ("reverse", -change), ("stop", 0.0)]
+    return [("stand", 0.0, 2 * LEAD), *((name, speed, lasts) for name, speed in driven)]
 
 
 def drive(robot: steps.Robot, plan: Sequence[tuple[str, float, float]]) -> Path:
@@ -88,7 +78,7 @@ def drive_undisturbed(
     robot: steps.Robot, designed: Designed, say: Callable[[str], None]
 ) -> tuple[list[Change], list[Finding]]:
     """Drive until nothing but the wheels shows; return the changes, and what is to be said."""
-    plan, namespace = designed.plan(), str(robot.client.node.get_namespace()).rstrip("/")
+    plan, namespace = plan_of(designed), str(robot.client.node.get_namespace()).rstrip("/")
     for left in reversed(range(ATTEMPTS)):
         say(f"driving on the new gains: {', '.join(name for name, *_ in plan)}")
         try:
@@ -110,63 +100,17 @@ def read_changes(
     bag: Path, plan: Sequence[tuple[str, float, float]], designed: Designed, namespace: str
 ) -> tuple[list[Change], float]:
     """Return every change from rest, and the longest wait of a wheel for an answer [s]."""
-    wheels = list(designed.document)
-    fields = ["encoder_count", "position", "voltage"]
-    wanted = {f"{namespace}/{w}/motor_state": fields for w in wheels}
-    wanted |= {f"{namespace}/{w}/pid_state": ["setpoint", "age", "dt", "output"] for w in wheels}
-    read = read_columns(bag, wanted)
-    changes, silence = [], 0.0
-    for wheel in wheels:
-        state = read[f"{namespace}/{wheel}/motor_state"]
-        answers = read[f"{namespace}/{wheel}/pid_state"]
-        delays = verification.arrival_delays(
-            (answers.seconds, answers.columns["age"], answers.columns["output"]),
-            (state.seconds, state.columns["voltage"]),
-            designed.document[wheel]["loop"],
-        )
-        changes += _changes(wheel, plan, designed, state, answers, delays)
-        # The first interval is that since another drive.
-        late = answers.columns["dt"][1:], delays[1:]
-        silence = max(silence, *(float(np.max(one, initial=0.0)) for one in late))
+    changes, silence = list[Change](), 0.0
+    for wheel, driven in read_drive(bag, list(designed.document), namespace).items():
+        moves = [
+            Move(name, _begin(wheel, setpoint, driven.answers), 0.0, setpoint, lasts)
+            for name, setpoint, lasts in plan
+            if setpoint
+        ]
+        found, waited = changes_of(wheel, driven, moves, designed)
+        changes += found
+        silence = max(silence, waited)
     return changes, silence
-
-
-def _changes(
-    wheel: str, plan: Sequence[tuple[str, float, float]], designed: Designed, state: Table,
-    answers: Table, delays: np.ndarray[Any, Any],
-) -> list[Change]:  # fmt: skip
-    """Return the changes of one wheel; the prediction is of its whole drive."""
-    estimate, document = designed.estimates[wheel], designed.document[wheel]
-    setpoints = answers.columns["setpoint"]
-    moves = [one for one in plan if one[1]]
-    begun = {name: (_begin(wheel, speed, answers), speed, lasts) for name, speed, lasts in moves}
-    end = max(begin + lasts for begin, _, lasts in begun.values())
-    shown = (state.seconds > answers.seconds[0] - LEAD) & (state.seconds < end)
-    instants = state.seconds[shown]
-    known = dict(zip(answers.seconds, delays))
-    waited = np.array([known.get(instant, np.nan) for instant in instants])
-    latest = np.searchsorted(answers.seconds, instants, side="right") - 1
-    asked = np.where(latest < 0, 0.0, setpoints[latest])
-    step = float(document["loop"]["sample_time"])
-    even, speed = verification.smoothed(
-        instants, driving.wheel_angle(state, estimate.hardware)[shown], step
-    )
-    rows = verification.predicted(
-        estimate, designed.gains[wheel], document["loop"], asked, (instants, waited), even
-    )
-    hardware = estimate.hardware
-    count = 2 * np.pi / (hardware.counts_per_revolution or 1e6) / hardware.gear_ratio
-    unsure = verification.resolution(count, step)
-    changes = []
-    for name, (begin, setpoint, lasts) in begun.items():
-        since = even - begin
-        kept = (since >= 0.0) & (since < lasts - 0.05)
-        measured = since[kept], speed[kept], rows[:, kept]
-        specification = document["specification"]
-        changes.append(
-            verification.change_of(wheel, name, setpoint, *measured, specification, unsure)
-        )
-    return changes
 
 
 def _begin(wheel: str, setpoint: float, answers: Table) -> float:

@@ -71,7 +71,7 @@ class Change:
 
     wheel: str  # whose
     name: str  # of the change in the drive
-    setpoint: float  # from rest [rad/s, wheel]
+    setpoint: float  # [rad/s, wheel]
     time: Array  # since the change [s]
     speed: Array  # as measured [rad/s, wheel]
     low: Array  # least of the predictions [rad/s]
@@ -80,6 +80,7 @@ class Change:
     reading: Reading  # of the measured speed
     expected: Reading  # of the motor as identified, with this drive's own samples
     bands: Reading  # what it may be at most, with what its record cannot resolve
+    tolerance: float  # within which both count as settled [share of the change]
     excess: float  # overshoot of the nominal motor beyond the design's [% of the change]
 
 
@@ -103,7 +104,7 @@ def resolution(quantum: float, step: float) -> float:
 
 
 def read(time: Array, speed: Array, setpoint: float, tolerance: float) -> Reading:
-    """Read a change from rest at time zero; ``tolerance`` is a share of the set-point."""
+    """Read a change from zero at time zero; ``tolerance`` is a share of the set-point."""
     relative = speed / setpoint
     settling = settling_time(time, relative, tolerance)
     late = time > time[-1] - STEADY
@@ -235,17 +236,19 @@ def _limit(readings: Sequence[float]) -> float:
 
 def change_of(
     wheel: str, name: str, setpoint: float, time: Array, speed: Array, rows: Array,
-    specification: Mapping[str, Any], unsure: float,
+    specification: Mapping[str, Any], unsure: float, before: float = 0.0,
 ) -> Change:  # fmt: skip
-    """Return a change with its reading and its bands."""
+    """Return a change from a speed ``before`` it [rad/s], with its reading and its bands."""
+    moved, change = speed - before, setpoint - before
     # What a planned change may overshoot is not held against its settling.
-    tolerance = SETTLED.value + OVERSHOOT.value + SIGMAS * unsure / abs(setpoint)
-    expected = read(time, rows[0], setpoint, tolerance)
+    tolerance = SETTLED.value + OVERSHOOT.value + SIGMAS * unsure / abs(change)
+    expected = read(time, rows[0] - before, change, tolerance)
     return Change(
         wheel, name, setpoint, time, speed, rows.min(axis=0), rows[0], rows.max(axis=0),
-        read(time, speed, setpoint, tolerance),
+        read(time, moved, change, tolerance),
         expected,
-        bands_of(rows, time, setpoint, specification, unsure),
+        bands_of(rows - before, time, change, specification, unsure),
+        tolerance,
         expected.overshoot - _high(specification, "overshoot") - 100 * (tolerance - SETTLED.value),
     )  # fmt: skip
 

@@ -31,7 +31,7 @@ def change(wheel: str, name: str, setpoint: float) -> Change:
     speed = setpoint * np.clip(time / 0.145, 0.0, 1.0)
     return Change(
         wheel, name, setpoint, time, speed, speed - 0.01, speed, speed + 0.01,
-        Reading(0.149, 1.3, 0.02), Reading(0.144, 0.7, 0.0), Reading(0.16, 3.0, 2.4), 0.0,
+        Reading(0.149, 1.3, 0.02), Reading(0.144, 0.7, 0.0), Reading(0.16, 3.0, 2.4), 0.03, 0.0,
     )  # fmt: skip
 
 

@@ -1,0 +1,65 @@
+"""Changes of set-point in a recorded drive: found by segment, read as the design states them."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+from wheel_simulation import Timing, simulate_closed_loop
+
+from smp_motor_control.motor.file import load_motors, paper_motors
+from smp_motor_control.motor.hardware import DriveSettings
+from smp_motor_ident.bag.storage import Table
+from smp_motor_ident.cli import driving, tune
+from smp_motor_ident.cli.tuning import read_estimates
+from smp_motor_ident.tune import verification
+
+WHEEL, STEP, LASTS = "front_left", 0.005, 1.0
+SEGMENTS = [("stand", 0.0), ("straight", 2.0), ("arc", 1.0), ("spin", -2.0), ("stop", 0.0)]
+
+
+def table(time: np.ndarray, **columns: np.ndarray) -> Table:
+    return Table(None, np.round(1e9 * time).astype(np.int64), columns)
+
+
+def test_a_drive_settles_when_tune_says(tmp_path: Path) -> None:
+    motors = paper_motors()
+    gains = tmp_path / "gains.yaml"
+    assert tune.main([str(motors), "--output", str(gains), "--supply", "12"]) == 0
+    given = driving.designed(read_estimates(motors), gains)
+    stated = json.loads((tmp_path / "gains.json").read_text())["wheels"][WHEEL]["settling"]
+    assert stated["common"]  # four wheels, one transition
+
+    entry = load_motors(motors)[WHEEL]
+    asked = [speed for _, speed in SEGMENTS]
+    run = simulate_closed_loop(
+        entry,
+        verification.loop_settings(given.gains[WHEEL]),
+        lambda t: asked[min(int(t / LASTS), len(asked) - 1)],
+        LASTS * len(asked),
+        timing=Timing(sample_time=STEP, delay=STEP),
+        drive=DriveSettings(command_timeout=math.inf),
+    )
+    none = np.full(run.time.size, np.nan)
+    state = table(run.time, encoder_count=run.count, position=none, voltage=none)
+    setpoints = np.array([asked[min(int(t / LASTS), len(asked) - 1)] for t in run.time])
+    steps = np.full(run.time.size, STEP)
+    answers = table(run.time, setpoint=setpoints, output=none, age=steps, dt=steps)
+    # A segment begins when it is sent, 12 ms before the wheel hears of it.
+    segments = [(name, k * LASTS - 0.012, (k + 1) * LASTS) for k, (name, _) in enumerate(SEGMENTS)]
+    moves = driving.moves_in(segments, answers)
+    assert [(m.name, m.before, m.setpoint) for m in moves] == [
+        ("straight", 0.0, 2.0), ("arc", 2.0, 1.0), ("spin", 1.0, -2.0), ("stop", -2.0, 0.0),
+    ]  # fmt: skip
+    changes, _ = driving.changes_of(WHEEL, driving.Driven(state, answers), moves, given)
+    for one in changes:
+        # Another size of change, with counts and a speed read from them: two samples.
+        assert abs(one.reading.settling - stated["value"]) <= 2 * STEP
+        assert abs(one.reading.settling - one.expected.settling) <= STEP
+        assert one.reading.overshoot < 1.0
+    # A wheel that lags behind is seen: the same drive, a tenth of a second late.
+    late = driving.Driven(table(run.time + 0.1, **state.columns), answers)
+    (behind, *_), _ = driving.changes_of(WHEEL, late, moves, given)
+    assert behind.reading.settling - stated["value"] > 0.05
