@@ -153,6 +153,17 @@ def test_gain_and_delay_margin_are_where_the_loop_turns_unstable(sample_time):
         assert (spectral_radius(sample(motors(*MOTOR_1), later), feedback)[0] < 1) == stable
 
 
+@pytest.mark.parametrize("delay", [0.07, 0.09, 0.11, 0.13])
+def test_delay_margin_counts_the_lag_to_the_next_turn_where_the_phase_is_beyond_180_deg(delay):
+    # A resonance of damping 0.05 at 20 rad/s that an integral and a long delay cross again, with
+    # phases between -180 and -540 deg: the loop is stable, and bears another 100 to 170 ms.
+    resonant, feedback = motors(1.0, 2 * 0.05 / 20, 1 / 20**2), Feedback(0.0, 4.0)
+    margins = loop_margins(sample(resonant, Loop(sample_time=0.005, delay=delay)), feedback)
+    for share, stable in ((0.0, True), (0.99, True), (1.01, False)):
+        later = Loop(sample_time=0.005, delay=delay + share * margins.delay)
+        assert (spectral_radius(sample(resonant, later), feedback)[0] < 1) == stable
+
+
 def test_batch_of_motors_is_the_motors_one_by_one():
     rng = np.random.default_rng(2)
     a0, a1, a2 = (x * rng.uniform(0.5, 2, 20) for x in MOTOR_1)
