@@ -8,8 +8,7 @@ from smp_motor_ident.cli import frame
 
 # Names of what is loaded only after the arguments are understood; a test holds them to it.
 METHODS = (
-    "margin", "optimise", "pole_placement", "simc", "lambda", "amigo", "ziegler_nichols",
-    "tyreus_luyben", "relay",
+    "margin", "pole_placement", "simc", "lambda", "ziegler_nichols", "tyreus_luyben", "relay",
 )  # fmt: skip
 FORMATS = (
     "ros2_controllers", "linorobot2", "ros_arduino_bridge", "arduino_pid", "roboclaw", "wpilib",

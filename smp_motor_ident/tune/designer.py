@@ -4,7 +4,7 @@ Methods work at the motor shaft; the gains that come out are per wheel rad/s.
 """
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -307,15 +307,13 @@ def _sensor(case: Case) -> str:
     return words
 
 
-def compare(
-    estimate: Estimate, loop: Loop, methods: Sequence[str] | None = None, **targets: Any
-) -> dict[str, Design | DesignError]:
-    """Design by every method, or those named, each with the targets that it understands.
+def compare(estimate: Estimate, loop: Loop, **targets: Any) -> dict[str, Design | DesignError]:
+    """Design by every method, each with the targets that it understands.
 
     A method that cannot meet the demand is there as its error.
     """
     results: dict[str, Design | DesignError] = {}
-    for name in METHODS if methods is None else methods:
+    for name in METHODS:
         known = (*COMMON, *METHODS[name].targets)
         own = {key: value for key, value in targets.items() if key in known}
         try:

@@ -41,10 +41,6 @@ class Loop:
     difference_window : int
         Samples over which the speed is averaged: by the controller for ``difference``, by the
         hardware for ``measured`` (0: an instantaneous speed, as of a tachometer).
-    derivative_filter_time_constant : float or None
-        Of the derivative [s]; None leaves it to the design.
-    observer_bandwidth : float or None
-        Bandwidth of the speed observer [rad/s]; None leaves it to the design.
     noise_voltage : float or None
         Largest control noise [V rms] that the measurement may cause at the output;
         None takes 4 % of the supply.
@@ -73,8 +69,6 @@ class Loop:
     supply_voltage: float = 12.0
     speed_source: SpeedSource = "measured"
     difference_window: int = 1
-    derivative_filter_time_constant: float | None = None
-    observer_bandwidth: float | None = None
     noise_voltage: float | None = None
     speed_noise: float = 0.0
     speed_step: float = 0.0

@@ -69,17 +69,6 @@ class Plant:
         """Which state is reported as the speed."""
         return self.phi.shape[1] - 1 if np.any(self.motors.sensor_lag > 0) else 0
 
-    def repeated(self, n: int) -> "Plant":
-        """Return a batch of ``n`` copies of a batch of one, for ``n`` controllers."""
-        return replace(
-            self,
-            phi=np.repeat(self.phi, n, axis=0),
-            taps=np.repeat(self.taps, n, axis=0),
-            phi_angle=np.repeat(self.phi_angle, n, axis=0),
-            taps_angle=np.repeat(self.taps_angle, n, axis=0),
-            average=np.repeat(self.average, n, axis=0),
-        )
-
     def response(self, omega: Array, *, true_speed: bool = False) -> Complex:
         """Return the frequency response from controller output to measured speed."""
         z = np.exp(1j * np.asarray(omega) * self.sample_time)

@@ -124,9 +124,8 @@ class Problem:
         return 1 / float(np.abs(self.plant.response(np.array([w]))[0, 0])), 2 * math.pi / w
 
     def filter_time(self, natural: float) -> float:
-        """Return the derivative filter: the loop's if it names one, else ``natural``."""
-        given = self.loop.derivative_filter_time_constant
-        return max(natural, 0.5 * self.loop.sample_time) if given is None else given
+        """Return the derivative's filter, not shorter than half a sample."""
+        return max(natural, 0.5 * self.loop.sample_time)
 
     def target(self, name: str, default: float, *, least: float = 0.0) -> float:
         """Return a numeric target, checked."""

@@ -1,4 +1,4 @@
-"""Step and load responses of the loop, a batch of motors or of controllers at once.
+"""Step and load responses of the loop, of a batch of motors at once.
 
 The running PID (saturation, anti-windup, set-point weights, feed-forward) on the sampled
 motor, everything at the motor shaft.  Coulomb friction acts as the voltage that it takes, with a
@@ -25,7 +25,7 @@ NO_EFFECT = Driver()
 
 @dataclass(frozen=True, eq=False)
 class Controller:
-    """A complete controller at the motor shaft; every number may be an array of shape (n,)."""
+    """A complete controller at the motor shaft."""
 
     feedback: Feedback  # gains that act on the measurement
     # weight, weight_d: Set-point weights of the proportional and the derivative action [-]
@@ -88,9 +88,8 @@ def simulate(
     The driver stands between what the controller puts out, which the observer knows, and the motor.
     """
     n, steps, fb = len(plant), inputs.low.size, controller.feedback
-    back = 1.0 / np.asarray(controller.tracking)
     numbers = (fb.p, fb.i, fb.d, fb.filter_time, controller.weight, controller.weight_d,
-               controller.limit, back)  # fmt: skip
+               controller.limit, 1.0 / controller.tracking)  # fmt: skip
     observer, none = plant.observer or NO_OBSERVER, np.zeros(steps)
     still = np.broadcast_to(0.0, (n, steps))
     noise = still if inputs.noise is None else inputs.noise
@@ -99,7 +98,7 @@ def simulate(
         plant.phi, plant.taps, plant.phi_angle, plant.taps_angle, plant.sample_time, plant.sensor,
         plant.average, observer.advance, observer.by_angle, observer.by_voltage, observer.taps,
         observer.variance,
-        np.stack([np.broadcast_to(np.asarray(x, dtype=np.float64), n) for x in numbers], axis=1),
+        np.array(numbers, dtype=np.float64),
         np.asarray(inputs.low, dtype=np.float64),
         np.asarray(inputs.low if inputs.high is None else inputs.high, dtype=np.float64),
         none if inputs.forward is None else inputs.forward,
@@ -174,7 +173,7 @@ def _run(
     by_voltage: Array,
     observer_taps: Array,
     variance: float,
-    controllers: Array,
+    controller: Array,
     low: Array,
     high: Array,
     forward: Array,
@@ -192,9 +191,9 @@ def _run(
     n, m, s = taps.shape
     steps, window = low.size, average.shape[1]
     speed, voltage = np.empty((n, steps)), np.empty((n, steps))
+    p, i, d, filter_time, weight, weight_d, limit, back = controller
     contradicted, memory = np.zeros(n, dtype=np.bool_), min(T / INNOVATION_MEMORY, 1.0)
     for j in range(n):
-        p, i, d, filter_time, weight, weight_d, limit, back = controllers[j]
         count_angle, eccentric = count_angles[j], eccentrics[j]
         x, following, past, put_out = np.zeros(s), np.zeros(s), np.zeros(m), np.zeros(m)
         angle = np.full(window + 1, count_angle * ((0.5 + 0.618034 * j) % 1.0))

@@ -77,7 +77,7 @@ def test_motor_file_of_identify_is_taken_as_it_is(tmp_path, capsys):
 def test_comparison_lists_every_method_and_recommends_one(identified, capsys):
     assert main([str(identified), "--compare"]) == 0
     words_shown = capsys.readouterr().out
-    for method in ("margin", "optimise", "simc", "amigo", "relay"):
+    for method in ("margin", "pole_placement", "simc", "relay"):
         assert f" {method} " in words_shown
     assert "* recommended: " in words_shown
 

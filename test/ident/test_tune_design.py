@@ -208,7 +208,7 @@ def test_comparison_recommends_a_sound_design_for_a_reason():
 
 
 def test_comparison_keeps_the_refusals_apart():
-    results = compare(estimate(), Loop(), ("margin", "simc"), bandwidth=1000.0)
+    results = compare(estimate(), Loop(), bandwidth=1000.0)
     assert isinstance(results["margin"], DesignError)
     assert not isinstance(results["simc"], DesignError)
 

@@ -71,13 +71,6 @@ def test_half_rule_keeps_the_sum_of_time_constants_and_delays():
     assert one.reduced.time_constant + one.reduced.delay == pytest.approx(a1 / a0 + 0.002)
 
 
-def test_amigo_gives_its_published_formula():
-    # Equal lag and delay of 1 s and a gain of 1: K = 0.15 + 0.35 - 1/4, Ti = 0.35 + 13/20.
-    feedback = METHODS["amigo"].solve(Reduced(FirstOrderDelay(1.0, 1.0, 1.0)))
-    assert feedback.p == pytest.approx(0.25)
-    assert feedback.p / feedback.i == pytest.approx(1.0)
-
-
 def test_lambda_cancels_the_pole_and_closes_the_loop_as_asked():
     feedback = METHODS["lambda"].solve(
         Reduced(FirstOrderDelay(2.0, 0.5, 0.1), closed_loop_time_constant=0.4)

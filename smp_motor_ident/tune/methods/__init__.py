@@ -1,8 +1,6 @@
 """Tuning methods, one idea a file, all behind one interface."""
 
-from smp_motor_ident.tune.methods.amigo import AMIGO
 from smp_motor_ident.tune.methods.margin import MARGIN
-from smp_motor_ident.tune.methods.optimise import OPTIMISE
 from smp_motor_ident.tune.methods.pole_placement import POLE_PLACEMENT
 from smp_motor_ident.tune.methods.relay import RELAY
 from smp_motor_ident.tune.methods.simc import LAMBDA, SIMC
@@ -12,11 +10,9 @@ METHODS = {
     method.name: method
     for method in (
         MARGIN,
-        OPTIMISE,
         POLE_PLACEMENT,
         SIMC,
         LAMBDA,
-        AMIGO,
         ZIEGLER_NICHOLS,
         TYREUS_LUYBEN,
         RELAY,
