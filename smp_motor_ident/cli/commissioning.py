@@ -125,7 +125,7 @@ def _begin(arguments: argparse.Namespace, robot: steps.Robot) -> Session | None:
     if left or (arguments.tuning and not made.has("tuning_page")):
         made.mark(identified=False, judged=False, tuned=False)
     parts = {part: made.has(part) for part in ("checked", "identified", "tuned")}
-    schedule = plan.schedule(robot.wheels, left, **parts)
+    schedule = plan.schedule(robot.wheels, left, **parts, tuning_page=arguments.tuning)
     session = Session(arguments, robot, made, schedule)
     _tell_controllers(arguments, robot)
     _confirm(arguments, robot.wheels, left, schedule)

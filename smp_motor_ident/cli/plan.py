@@ -34,6 +34,7 @@ CHECK, START, COMPUTE, DRIVE = 8.0, 4.0, 4.0, 12.0
 """First guesses [s]: the test of one wheel, the start and end of processes around a signal, the
 identification or tuning of one wheel, the drive."""
 
+PAGE = 2  # times an identification that its tuning page takes
 DRAWN, COLUMNS, BLOCKS = 4.0, 72, "▁▂▃▄▅▆▇█"
 """So many seconds of a signal are drawn, on so many columns, with these levels."""
 
@@ -159,6 +160,7 @@ def schedule(
     checked: bool = False,
     identified: bool = False,
     tuned: bool = False,
+    tuning_page: bool = False,
 ) -> Schedule:
     """Return the whole way of a commissioning, without what is done already."""
     made = Schedule()
@@ -167,7 +169,8 @@ def schedule(
     for part in parts:
         made.add(part.part, "signal", part.excitation.duration + START)
     if not identified:
-        made.add(IDENTIFYING, "identify", COMPUTE * len(wheels))
+        pages = 1 + PAGE * tuning_page
+        made.add(IDENTIFYING, "identify", pages * COMPUTE * len(wheels))
     if not tuned:
         made.add(TUNING, "tune", COMPUTE * len(wheels))
     made.add(DRIVING, "drive", DRIVE)

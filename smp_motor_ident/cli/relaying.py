@@ -34,7 +34,11 @@ def tune_by_relay(arguments: argparse.Namespace, files: Sequence[Path]) -> int:
             f"a bias of {bias:g} V"
         )
     check_free(files, arguments.force)
-    print(f"{wheel} turns at {bias:g} V, then switches by {amplitude:g} V around it", flush=True)
+    print(
+        f"{wheel} turns at {bias:g} V, then switches by {amplitude:g} V around it for "
+        f"{arguments.relay_seconds:g} s",
+        flush=True,
+    )
     with connect("tune", arguments.ros_arguments) as robot:
         from smp_motor_control.nodes.relay_test import Relay, oscillate
 

@@ -2,7 +2,7 @@
 
 import argparse
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping, Sequence, Sized
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +24,8 @@ from smp_motor_ident.tune.wheels import WheelSet
 from smp_motor_ident.tune.writing import gains_document, gains_yaml, parameters
 
 DEFAULT_RATE = 200.0  # steps per second where neither the user nor the identification says [Hz]
+SOURCES, COMPARISON, DESIGN = 1.0, 3.0, 2.0
+"""What a wheel takes on one core [s]: comparing sources of speed, comparing methods, a design."""
 
 
 def work(arguments: argparse.Namespace) -> int:
@@ -109,19 +111,24 @@ def _design(
     method = arguments.method
     with frame.progress("tune") as say:
         if arguments.speed_source == "auto":
-            say("comparing the sources of speed")
+            say(_taking("comparing the sources of speed", SOURCES, estimates))
             loops, reasons["speed_sources"] = choose_sources(estimates, loops, targets)
         if arguments.compare:
-            say("comparing the methods")
+            say(_taking("comparing the methods", COMPARISON, estimates))
             method = _compare(estimates, loops, targets)
             known = (*METHODS[method].targets, *case.COMMON)
             targets = {k: v for k, v in targets.items() if k in known}
-        say("designing")
+        say(_taking("designing", DESIGN, estimates))
         wheels = design_wheels(
             estimates, loops, method, arguments.sets, together=not arguments.alone, **targets
         )
     print("".join(f"{line}\n" for line in reasons["speed_sources"]), end="")
     return wheels, reasons
+
+
+def _taking(text: str, seconds: float, wheels: Sized) -> str:
+    """Return what is done, and about how long it takes."""
+    return f"{text}, which takes about {seconds * len(wheels):.0f} s"
 
 
 def _write(
@@ -173,7 +180,7 @@ def _export(arguments: argparse.Namespace) -> int:
     loops = {wheel: loop_for(one, arguments) for wheel, one in estimates.items()}
     targets = _targets(arguments)
     with frame.progress("tune") as say:
-        say(f"designing for {target.title}")
+        say(_taking(f"designing for {target.title}", DESIGN, estimates))
         text, _ = export(arguments.export, estimates, loops, **targets)
     if output is None:
         print(text, end="")

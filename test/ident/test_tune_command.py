@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -80,6 +82,19 @@ def test_comparison_lists_every_method_and_recommends_one(identified, capsys):
     for method in ("margin", "pole_placement", "simc", "relay"):
         assert f" {method} " in words_shown
     assert "* recommended: " in words_shown
+
+
+def test_every_step_says_how_long_it_will_take(identified, monkeypatch):
+    told: list[str] = []
+
+    @contextlib.contextmanager
+    def progress(*_: object) -> Iterator[Callable[[str], None]]:
+        yield told.append
+
+    monkeypatch.setattr(tuning.frame, "progress", progress)
+    assert main([str(identified), "--compare"]) == 0
+    assert main([str(identified), "--export", "wpilib"]) == 0
+    assert len(told) == 4 and all(" takes about " in text for text in told), told
 
 
 def test_small_gains_are_shown_with_their_digits():
