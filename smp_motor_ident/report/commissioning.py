@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from itertools import groupby
 from typing import TYPE_CHECKING, Any
@@ -80,13 +80,14 @@ def _motor(estimates: Mapping[str, Estimate]) -> Iterator[Row]:
         found = [one.get(name, Quantity(None)) for one in held]
         if any(one.value is not None for one in found):
             unit = next(words.scaled(one).unit for one in found if one.value is not None)
-            stds = [one.random_std(name) for one in estimates.values()]
-            cells = tuple(_stated(one, std) for one, std in zip(found, stds))
-            yield Row(words.label(name), words.typeset(unit), cells)
+            yield Row(words.label(name), words.typeset(unit), tuple(map(_stated, found)))
+        if any(one.systematic for one in found):
+            cells = tuple(words.systematic(one) for one in found)
+            yield Row(f"{words.label(name)}, systematic", "", cells)
 
 
-def _stated(quantity: Quantity, std: float) -> str:
-    shown = words.scaled(replace(quantity, std=std))
+def _stated(quantity: Quantity) -> str:
+    shown = words.scaled(quantity)
     value = words.number(shown.value, shown.std)
     if quantity.value is None or quantity.status != "estimated":
         return value

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,7 @@ from smp_motor_control import WHEELS
 from smp_motor_ident.cli.protocol import Protocol
 from smp_motor_ident.diagnosis.wheel_test import Figures
 from smp_motor_ident.report.document import identification_document
-from smp_motor_ident.result import to_json
+from smp_motor_ident.result import Share, to_json
 from smp_motor_ident.tune.verification import Change, Reading
 
 pytestmark = pytest.mark.skipif(not CHROMIUM, reason="no Chromium on this machine")
@@ -39,6 +40,11 @@ def change(wheel: str, name: str, setpoint: float) -> Change:
 def passed(tmp_path: Path) -> Path:
     """A folder with a commissioning that passed, of four wheels that drove both ways."""
     estimates = {wheel: estimate(wheel) for wheel in WHEELS}
+    scale = (Share("current_scale", 0.03, 0.39),)
+    first = estimates[WHEELS[0]]
+    resistance = replace(first.parameters["resistance"], systematic=scale)
+    held = {**first.parameters, "resistance": resistance}
+    estimates[WHEELS[0]] = replace(first, parameters=held)
     (tmp_path / "identification").mkdir()
     text = to_json(identification_document(estimates))
     (tmp_path / "identification" / "identification.json").write_text(text)
@@ -80,6 +86,8 @@ def test_page_opens_with_motors_and_gains_then_yaml_then_the_drive(
         rows = {row.split("\t")[0]: row.split("\t")[1:] for row in shown(browser, "#results tr")}
         assert rows["p V s/rad"] == ["2.675"] * 4 and rows["i V/rad"] == ["87.97"] * 4
         assert rows["DC gain rad/s/V"] == ["25.50 ± 0.1"] * 4
+        assert rows["Resistance Ω"] == ["12.92 ± 0.13"] * 4  # systematic errors stand apart
+        assert rows["Resistance, systematic"][0] == "± 3 % (current scale)"
         assert rows["Settles, designed at most ms"] == ["150"] * 4
         assert rows["Settles, driven ms"] == ["149"] * 4
         # What is copied is the parameter file.
