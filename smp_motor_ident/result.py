@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
@@ -321,43 +321,6 @@ class Estimate:
         """
         found = (f.evidence.get(name) for f in self.findings if f.code == code)
         return max((float(x) for x in found if isinstance(x, int | float)), default=0.0)
-
-    def samples_of(self, names: Sequence[str], n: int, rng: np.random.Generator) -> Array:
-        """Draw from the distribution of the estimation error around the estimate.
-
-        Quantities that are positive by nature are drawn log-normally, so that no draw has
-        the wrong sign.  A name that has no covariance is returned as its value.
-
-        Parameters
-        ----------
-        names : sequence of str
-            Parameters or combinations.
-        n : int
-            Number of draws.
-        rng : numpy.random.Generator
-            Source of randomness.
-
-        Returns
-        -------
-        ndarray, shape (n, len(names))
-            One draw a row.
-        """
-        drawn = np.tile([self.value(name) for name in names], (n, 1)).astype(np.float64)
-        positive = [name for name in names if name in self.names and self.value(name) > 0]
-        if not positive:
-            return drawn
-        index = [self.names.index(name) for name in positive]
-        mean = np.array([self.value(name) for name in positive])
-        relative = self.covariance[np.ix_(index, index)] / np.outer(mean, mean)
-        # A log-normal with this log-mean and log-covariance has exactly the estimate as its
-        # mean and the relative covariance above.
-        log_covariance = np.log1p(np.maximum(relative, -1 + 1e-12))
-        draws = rng.multivariate_normal(
-            -np.diag(log_covariance) / 2, log_covariance, n, method="eigh", check_valid="ignore"
-        )
-        for column, name in enumerate(positive):
-            drawn[:, list(names).index(name)] = mean[column] * np.exp(draws[:, column])
-        return drawn
 
     def to_document(self) -> dict[str, Any]:
         """Return the motor's entry of ``identification.json``.

@@ -8,7 +8,7 @@ from smp_motor_ident.cli import frame
 
 # Names of what is loaded only after the arguments are understood; a test holds them to it.
 METHODS = (
-    "margin", "pole_placement", "simc", "lambda", "ziegler_nichols", "tyreus_luyben", "relay",
+    "margin", "pole_placement", "simc", "ziegler_nichols", "tyreus_luyben", "relay",
 )  # fmt: skip
 FORMATS = (
     "ros2_controllers", "linorobot2", "ros_arduino_bridge", "arduino_pid", "roboclaw", "wpilib",
@@ -21,7 +21,7 @@ AIMS: dict[str, dict[str, Any]] = {
     "focus": dict(choices=("balanced", "tracking", "load")),
     "bandwidth": dict(type=float, help="crossover [rad/s]"),
     "structure": dict(choices=("pi", "pid")),
-    "closed_loop_time_constant": dict(type=float, help="[s], of simc and lambda"),
+    "closed_loop_time_constant": dict(type=float, help="[s], of simc"),
     "natural_frequency": dict(type=float, help="[rad/s], of pole_placement"),
     "damping": dict(type=float, help="of pole_placement, 0.8"),
     "max_velocity": dict(type=float, help="[rad/s, wheel]"),

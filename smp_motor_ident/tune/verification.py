@@ -18,7 +18,7 @@ from smp_motor_control.encoder import Encoder
 from smp_motor_control.fields import parameters_in, settings_of
 from smp_motor_control.motor.file import MotorEntry
 from smp_motor_control.motor.hardware import DrivenMotor, DriveSettings
-from smp_motor_control.motor.parameters import Gearbox, MotorParameters
+from smp_motor_control.motor.parameters import COMBINATIONS, Gearbox, MotorParameters
 from smp_motor_control.parameter_file import flat
 from smp_motor_control.wheel.loop import LoopSettings, WheelLoop
 from smp_motor_ident.finding import Finding
@@ -31,6 +31,7 @@ from smp_motor_ident.tune.limits import (
     SILENCE,
     STEADY_ERROR,
 )
+from smp_motor_ident.tune.motors import draw_motors, motors_of
 from smp_motor_ident.tune.simulation import settling_time
 
 SMOOTHING = 0.05
@@ -310,26 +311,18 @@ def loop_settings(parameters: Mapping[str, Any]) -> LoopSettings:
 
 def _motors(estimate: Estimate, supply: float) -> list[MotorEntry]:
     """Return the nominal motor and draws of what the estimate leaves open."""
-    names = ("dc_gain", "time_constant", "time_constant_product", "static_voltage", "delay")
-    rows = np.vstack([
-        [estimate.value(name) for name in names],
-        estimate.samples_of(names, DRAWS, np.random.default_rng(0)),
-    ])  # fmt: skip
+    nominal = motors_of(estimate)
+    drawn = draw_motors(estimate, DRAWS, np.random.default_rng(0))
     hardware = estimate.hardware
     gearbox = Gearbox(hardware.gear_ratio)
     encoder = Encoder(hardware.counts_per_revolution or 1e6, 0)
-    return [
-        MotorEntry(
-            MotorParameters.from_combinations(
-                dc_gain=gain,
-                time_constant=slow,
-                time_constant_product=max(product, 0.0),
-                static_voltage=max(friction, 0.0),
-            ),
-            gearbox,
-            encoder,
-            supply,
-            max(delay, 0.0),
+    entries = []
+    for batch in (nominal, *([nominal] * DRAWS if drawn is None else [drawn])):
+        rows = np.broadcast_arrays(
+            1 / batch.a0, batch.a1 / batch.a0, batch.a2 / batch.a0, batch.static_voltage
         )
-        for gain, slow, product, friction, delay in rows.tolist()
-    ]
+        delays = np.broadcast_to(batch.delay, rows[0].shape)
+        for combined, delay in zip(np.transpose(rows).tolist(), delays.tolist()):
+            motor = MotorParameters.from_combinations(**dict(zip(COMBINATIONS, combined)))
+            entries.append(MotorEntry(motor, gearbox, encoder, supply, delay))
+    return entries

@@ -48,34 +48,6 @@ def test_numbers_that_do_not_exist_are_null_never_nan():
     assert estimate.to_document()["combinations"]["dc_gain"]["std"] is None
 
 
-def test_draws_have_the_mean_and_covariance_of_the_estimate():
-    estimate = an_estimate()
-    n = 200_000
-    draws = estimate.samples_of(estimate.names, n, np.random.default_rng(1))
-    # Standard error of a mean is std/sqrt(n); of a variance, relative sqrt(2/n) = 0.3 %.
-    std = np.sqrt(np.diag(estimate.covariance))
-    assert np.all(np.abs(draws.mean(0) - [25.5, 0.05]) < 5 * std / np.sqrt(n) + 1e-3 * std)
-    np.testing.assert_allclose(np.cov(draws.T), estimate.covariance, rtol=0.03)
-
-
-def test_draws_of_positive_quantities_stay_positive_however_uncertain():
-    estimate = Estimate(
-        "w",
-        "m",
-        {},
-        {"delay": Quantity(0.001, 0.002)},
-        names=("delay",),
-        covariance=np.array([[4e-6]]),
-    )
-    assert np.all(estimate.samples_of(["delay"], 10_000, np.random.default_rng(2)) > 0)
-
-
-def test_a_name_without_covariance_is_drawn_as_its_value():
-    draws = an_estimate().samples_of(["static_voltage", "dc_gain"], 5, np.random.default_rng(3))
-    assert np.all(draws[:, 0] == 0)
-    assert draws.shape == (5, 2)
-
-
 def test_value_falls_back_to_the_given_default():
     assert an_estimate().value("resistance", 7.0) == 7.0
     assert an_estimate().value("dc_gain") == pytest.approx(25.5, rel=1e-15)  # stored, not computed

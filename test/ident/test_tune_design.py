@@ -11,6 +11,7 @@ import pytest
 from smp_motor_ident.errors import DesignError
 from smp_motor_ident.result import Estimate, Quantity
 from smp_motor_ident.tune import METHODS, Loop, compare, design, design_wheels, recommend
+from smp_motor_ident.tune.motors import draw_motors
 
 # The paper's Table 1: R, L, K, J, b.
 TABLE_1 = (
@@ -205,6 +206,31 @@ def test_comparison_recommends_a_sound_design_for_a_reason():
         sound = other.margins.sensitivity <= 1.6
         if sound and other.performance.control_noise <= other.loop.noise_limit:
             assert chosen.performance.load_integral <= other.performance.load_integral
+
+
+def test_draws_have_the_mean_and_covariance_of_the_estimate():
+    names, n = ("dc_gain", "time_constant"), 100_000
+    covariance = np.array([[0.25, 6e-4], [6e-4, 4e-6]])
+    values = (25.5, 0.05)
+    uncertain = Estimate(
+        "w", "m", {}, {k: Quantity(v) for k, v in zip(names, values)}, names=names,
+        covariance=covariance,
+    )  # fmt: skip
+    drawn = draw_motors(uncertain, n, np.random.default_rng(1))
+    draws = np.array([1 / drawn.a0, drawn.a1 / drawn.a0])
+    # Standard error of a mean is std/sqrt(n); of a variance, relative sqrt(2/n) = 0.4 %.
+    std = np.sqrt(np.diag(covariance))
+    assert np.all(np.abs(draws.mean(1) - values) < 5 * std / np.sqrt(n))
+    np.testing.assert_allclose(np.cov(draws), covariance, rtol=0.03)
+
+
+def test_draws_of_positive_quantities_stay_positive_however_uncertain():
+    vague = Estimate(
+        "w", "m", {}, {"dc_gain": Quantity(25.0), "time_constant": Quantity(0.05)},
+        names=("time_constant",), covariance=np.array([[0.01]]),
+    )  # fmt: skip
+    drawn = draw_motors(vague, 10_000, np.random.default_rng(2))
+    assert np.all(drawn.a1 / drawn.a0 > 0) and np.all(1 / drawn.a0 == 25.0)
 
 
 def test_comparison_keeps_the_refusals_apart():

@@ -71,8 +71,8 @@ def test_half_rule_keeps_the_sum_of_time_constants_and_delays():
     assert one.reduced.time_constant + one.reduced.delay == pytest.approx(a1 / a0 + 0.002)
 
 
-def test_lambda_cancels_the_pole_and_closes_the_loop_as_asked():
-    feedback = METHODS["lambda"].solve(
+def test_simc_cancels_the_pole_and_closes_the_loop_as_asked():
+    feedback = METHODS["simc"].solve(
         Reduced(FirstOrderDelay(2.0, 0.5, 0.1), closed_loop_time_constant=0.4)
     )
     assert feedback.p == pytest.approx(0.5 / (2.0 * 0.5))

@@ -3,7 +3,7 @@
 from smp_motor_ident.tune.methods.margin import MARGIN
 from smp_motor_ident.tune.methods.pole_placement import POLE_PLACEMENT
 from smp_motor_ident.tune.methods.relay import RELAY
-from smp_motor_ident.tune.methods.simc import LAMBDA, SIMC
+from smp_motor_ident.tune.methods.simc import SIMC
 from smp_motor_ident.tune.methods.ziegler_nichols import TYREUS_LUYBEN, ZIEGLER_NICHOLS
 
 METHODS = {
@@ -12,7 +12,6 @@ METHODS = {
         MARGIN,
         POLE_PLACEMENT,
         SIMC,
-        LAMBDA,
         ZIEGLER_NICHOLS,
         TYREUS_LUYBEN,
         RELAY,
