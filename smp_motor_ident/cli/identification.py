@@ -199,12 +199,12 @@ def _tunings(outcomes: Mapping[str, Outcome], say: Callable[..., None]) -> dict[
         except SmpError as error:  # such as of a motor whose supply is not known
             unknown[wheel] = tuning_page.Tuning(wheel, reason=str(error))
 
-    def side_by_side(jobs: Mapping[str, Callable[[], Tuning]]) -> dict[str, Tuning]:
-        each = {wheel: lambda _, job=job: job() for wheel, job in jobs.items()}
-        return workers.in_parallel(each, say, "designing for")
-
-    usable = {wheel: known[wheel] for wheel in loops}
-    return {**unknown, **tuning_page.tunings_of(usable, loops, side_by_side)}
+    designs, refused = tuning_page.designs_of({w: known[w] for w in loops}, loops)
+    jobs = {
+        wheel: lambda _, w=wheel, own=own: tuning_page.tuning_of(known[w], loops[w], own)
+        for wheel, own in designs.items()
+    }
+    return {**unknown, **refused, **workers.in_parallel(jobs, say, "designing for")}
 
 
 def _contents(

@@ -3,9 +3,8 @@
 Nothing of control is computed in the page; its sliders choose among these designs.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -39,15 +38,6 @@ LIMIT = METHODS["margin"].required.sensitivity
 SAMPLES = 100  # motors that the bands of a choice are over: their ends are the least and largest
 
 
-Parallel = Callable[[Mapping[str, Callable[[], "Tuning"]]], Mapping[str, "Tuning"]]
-"""What does jobs by name, side by side or not."""
-
-
-def one_by_one(jobs: Mapping[str, Callable[[], "Tuning"]]) -> Mapping[str, "Tuning"]:
-    """Do jobs one after the other."""
-    return {name: job() for name, job in jobs.items()}
-
-
 @dataclass(frozen=True, eq=False)
 class Choice:
     """One design of the page, or why there is none at this place of the sliders."""
@@ -70,23 +60,17 @@ class Tuning:
     reason: str = ""  # why there is no design at all
 
 
-def tunings_of(
-    estimates: Mapping[str, Estimate], loops: Mapping[str, Loop], each: Parallel = one_by_one
-) -> dict[str, Tuning]:
-    """Design every wheel's controller at every place of the sliders, at the pace of all wheels.
-
-    What is chosen at first are the designs of ``tune``.
-    """
+def designs_of(
+    estimates: Mapping[str, Estimate], loops: Mapping[str, Loop]
+) -> tuple[Mapping[str, Design], dict[str, Tuning]]:
+    """Return the designs of ``tune``, all wheels together, and the wheels that have none."""
     refused: dict[str, Tuning] = {}
     while left := {w: one for w, one in estimates.items() if w not in refused}:
         try:
-            own = design_wheels(left, loops).designs
+            return design_wheels(left, loops).designs, refused
         except SmpError as error:
             refused |= _refused(left, loops) or {w: Tuning(w, reason=str(error)) for w in left}
-            continue
-        jobs = {w: partial(_tuning, one, loops[w], own[w]) for w, one in left.items()}
-        return {**refused, **each(jobs)}
-    return refused
+    return {}, refused
 
 
 def _refused(estimates: Mapping[str, Estimate], loops: Mapping[str, Loop]) -> dict[str, Tuning]:
@@ -100,7 +84,11 @@ def _refused(estimates: Mapping[str, Estimate], loops: Mapping[str, Loop]) -> di
     return found
 
 
-def _tuning(estimate: Estimate, loop: Loop, own: Design) -> Tuning:
+def tuning_of(estimate: Estimate, loop: Loop, own: Design) -> Tuning:
+    """Design one wheel's controller at every place of the sliders, around the design of ``tune``.
+
+    All change their set-point at its pace where that is common to several wheels.
+    """
     choices = [
         Choice(share * own.margins.crossover, margin, own, curves(estimate, own))
         if share == SHARES[-1] and margin == USUAL

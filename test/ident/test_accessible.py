@@ -17,7 +17,7 @@ from smp_motor_ident.report import commissioning, fleet, tuning_page
 from smp_motor_ident.report.figures import Comparison
 from smp_motor_ident.report.html import Report, render
 from smp_motor_ident.result import plain
-from smp_motor_ident.tune import Loop
+from smp_motor_ident.tune import Loop, design
 from smp_motor_ident.tune.verification import Change, Reading
 
 AXE = find_spec("axe_core_python")
@@ -41,7 +41,7 @@ def report(monkeypatch: pytest.MonkeyPatch) -> str:
         Report(
             {one.wheel: one, other.wheel: other}, {one.wheel: [compared]},
             {"rear_left": "voltage is constant; excite the motor"}, {"Command": "identify a b"},
-            tuning_page.tunings_of({one.wheel: one}, {one.wheel: loop}),
+            {one.wheel: tuning_page.tuning_of(one, loop, design(one, loop))},
         )
     )  # fmt: skip
 

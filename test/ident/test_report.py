@@ -23,7 +23,7 @@ from smp_motor_ident.report.tuning_page import tuning_charts
 from smp_motor_ident.result import (
     ResidualTests,
 )
-from smp_motor_ident.tune import Loop
+from smp_motor_ident.tune import Loop, design
 from smp_motor_ident.tune.curves import Curves
 
 
@@ -146,7 +146,7 @@ def test_sliders_of_the_tuning_page_choose_designs_that_tune_has_made(
     monkeypatch.setattr(tuning_page, "MARGINS", (60.0,))
     monkeypatch.setattr(tuning_page, "SAMPLES", 20)
     loop = Loop(sample_time=0.005, gear_ratio=65.5, counts_per_revolution=500, supply_voltage=12.0)
-    tuning = tuning_page.tunings_of({"front_left": estimate()}, {"front_left": loop})["front_left"]
+    tuning = tuning_page.tuning_of(estimate(), loop, design(estimate(), loop))
     soft, own = tuning.choices
     assert soft.design is not None and own.design is not None
     assert tuning.chosen == 1
