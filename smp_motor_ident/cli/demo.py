@@ -17,7 +17,6 @@ def parser() -> Parser:
     made.add_argument("--motors", metavar="FILE", help="the true motors; default: the paper's")
     made.add_argument("--rate", type=number(0), default=200.0, help="samples per second [Hz]")
     made.add_argument("--domain", type=int, help="ROS domain; default: one that is free")
-    made.add_argument("--keep", action="store_true", help="refuse to replace an earlier demo")
     return made
 
 

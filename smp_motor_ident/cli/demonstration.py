@@ -49,7 +49,7 @@ def work(arguments: argparse.Namespace) -> int:
 
     motors = Path(arguments.motors) if arguments.motors else paper_motors()
     truth = load_motors(motors, WHEELS)
-    folder = _fresh(Path(arguments.output), arguments.keep)
+    folder = _fresh(Path(arguments.output))
     domain = free_domain() if arguments.domain is None else arguments.domain
     os.environ.update(ROS_DOMAIN_ID=str(domain), ROS_AUTOMATIC_DISCOVERY_RANGE="LOCALHOST")
     with Processes(folder / "logs") as processes, connect(demo.NAME) as client:
@@ -78,10 +78,10 @@ def work(arguments: argparse.Namespace) -> int:
     return 0 if all(one.holds for one in checks) else 1
 
 
-def _fresh(folder: Path, keep: bool) -> Path:
+def _fresh(folder: Path) -> Path:
     """Return an empty folder; an earlier demo's is emptied, anything else is left alone."""
     if folder.exists():
-        if keep or not (folder / "logs").is_dir():
+        if not (folder / "logs").is_dir():
             raise ParameterError(f"{folder}: exists already; choose another --output")
         shutil.rmtree(folder)
     return folder
