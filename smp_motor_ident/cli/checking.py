@@ -14,7 +14,7 @@ from smp_motor_ident.diagnosis.wheel_test import Figures, Phase, Trace, answers_
 from smp_motor_ident.finding import Finding
 from smp_motor_ident.record import Hardware
 
-REST, COAST = 0.3, 0.4  # zero voltage before and behind [s]; a coast of a few time constants
+REST, COAST = 0.3, 0.4  # zero voltage before and after [s]; a coast of a few time constants
 LONGEST_HOLD = 2.0  # a voltage is held for so long where the wheel is slow [s]
 RAMP = 0.15  # growth of the voltage until the wheel turns [of the supply per second]
 GROWTH = 2.0  # of the voltage from one level to the next

@@ -22,7 +22,7 @@ def parser() -> Parser:
     add("--wheel", action="append", metavar="NAME", help="only this; default: all that report")
     add("--amplitude", type=number(0), help="largest voltage [V]; default 6")
     add("--duration", type=number(0), help="of each of three signals [s]; default 15")
-    add("--motors", metavar="FILE", help="what is known of the motors, to check gearing by")
+    add("--motors", metavar="FILE", help="motor file with known values, to check the gearing by")
     add("--max-speed", type=number(0), metavar="RAD/S",
         help="of a wheel; default: half more than its checks show for the voltage")  # fmt: skip
     add("--max-current", type=number(0), default=0.0, metavar="A", help="of a motor; default any")

@@ -1,7 +1,7 @@
 """What ``commission`` does: the whole way on the user's own running robot.
 
-What is done is kept as soon as it is whole: what the checks came to, and every recording.  A run
-that is gone on with does the rest at the same voltages, and so ends as one that was not cut off.
+Figures of the checks, recordings, identification and gains are kept as soon as each is complete.  A
+resumed run does the rest at the same voltages, and so ends as one that was not interrupted.
 """
 
 import argparse
@@ -44,7 +44,7 @@ _say = partial(print, flush=True)
 
 @dataclass
 class Session:
-    """A commissioning under way: what is asked, of which robot, and how far it is."""
+    """A commissioning under way: its request, its robot, and its progress."""
 
     arguments: argparse.Namespace
     robot: steps.Robot
@@ -52,7 +52,7 @@ class Session:
     schedule: plan.Schedule
 
     def begin(self, part: str, how: str = "") -> None:
-        """Say what is done next, and how long all takes."""
+        """Print the next part, and how long all takes."""
         _say(self.schedule.begin(part, how))
 
 
@@ -74,7 +74,7 @@ def work(arguments: argparse.Namespace) -> int:
 
 
 def _as_begun(arguments: argparse.Namespace, document: dict[str, Any]) -> None:
-    """Fill in what is not asked for: as in the run that is gone on with, else the defaults."""
+    """Fill in missing arguments from the run that is resumed, else the defaults."""
     earlier = document.get("asked", {})
     arguments.wheel = arguments.wheel or earlier.get("wheels")
     arguments.amplitude = arguments.amplitude or earlier.get("amplitude", AMPLITUDE)
@@ -146,11 +146,11 @@ def _tell_controllers(arguments: argparse.Namespace, robot: steps.Robot) -> None
             "start it, or leave out --apply"
         )
     if missing:
-        _say(f"no wheel_pid runs for {missing}: one is started for the drive, and ended behind it")
+        _say(f"no wheel_pid runs for {missing}: one is started for the drive and ended after it")
 
 
 def _recordings(arguments: argparse.Namespace, made: Protocol) -> list[plan.Recording]:
-    """Return what is recorded at the voltage that the checks found, or before them at the most."""
+    """Return the recordings at the voltage that the checks found, or before them at the largest."""
     amplitude = made.document["amplitude"] if made.has("checked") else arguments.amplitude
     return plan.recordings(amplitude, arguments.duration)
 

@@ -14,6 +14,7 @@ from smp_motor_control.motor.parameters import Gearbox
 from smp_motor_ident.bag.decode import read_columns
 from smp_motor_ident.bag.storage import Table
 from smp_motor_ident.cli import applying
+from smp_motor_ident.cli.processes import ProcessError
 from smp_motor_ident.record import Hardware
 from smp_motor_ident.report.chart import Chart, Curve
 from smp_motor_ident.report.drawing import document
@@ -23,6 +24,7 @@ from smp_motor_ident.tune.verification import Change
 
 LEAST_CHANGE = 0.8  # a smaller change of the set-point [rad/s, wheel] is no step to judge
 LEAD = 0.3  # rest before a drive that is simulated with it [s]
+MOST_SAMPLES = 1e6  # of a drive, which takes seconds
 STATE = ("encoder_count", "position", "voltage")
 ANSWER = ("setpoint", "age", "dt", "output")
 
@@ -106,7 +108,9 @@ def changes_of(
     # The first interval is that since another drive.
     late = answers.columns["dt"][1:], delays[1:]
     silence = max(float(np.max(one, initial=0.0)) for one in late)
-    end = max((one.begin + one.lasts for one in moves), default=0.0)
+    if not moves:
+        return [], silence
+    end = max(one.begin + one.lasts for one in moves)
     shown = (state.seconds > answers.seconds[0] - LEAD) & (state.seconds < end)
     instants = state.seconds[shown]
     known = dict(zip(answers.seconds, delays))
@@ -114,6 +118,12 @@ def changes_of(
     latest = np.searchsorted(answers.seconds, instants, side="right") - 1
     asked = np.where(latest < 0, 0.0, answers.columns["setpoint"][latest])
     step = float(entry["loop"]["sample_time"])
+    if np.ptp(instants) > MOST_SAMPLES * step:
+        raise ProcessError(
+            f"{wheel}: the stamps of the drive span {np.ptp(instants):.3g} s at {step:.3g} s a "
+            "sample: a clock was set meanwhile, or two nodes publish motor_state. Look at the "
+            "clocks and the nodes, then drive again"
+        )
     even, speed = verification.smoothed(
         instants, wheel_angle(state, estimate.hardware)[shown], step
     )
@@ -139,7 +149,7 @@ def drive_figure(
     sides: Mapping[str, Sequence[str]],
     hardware: Mapping[str, Hardware],
 ) -> str:
-    """Return an SVG file: what the wheels of each side were asked for, and what they did."""
+    """Return an SVG file of set-points and speeds of the wheels of each side."""
     wheels = list(hardware)
     begin = min(float(one.state.seconds[0]) for one in drive.values())
     charts = []

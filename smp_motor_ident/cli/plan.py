@@ -25,7 +25,7 @@ SIGNALS = (
 """What moves the wheels: signal, shares of amplitude and duration, and whose recording."""
 
 FURTHER = "further"  # name of the recording that an identification asks for
-# Parts behind the recordings
+# Parts after the recordings
 IDENTIFYING, AGAIN, TUNING = "identifying", "identifying again", "tuning"
 DRIVING = "driving on the new gains"
 
@@ -53,14 +53,14 @@ class Recording:
         return f"exciting: {self.name}"
 
     def describe(self) -> str:
-        """Return what is sent, in words."""
+        """Return the signal in words."""
         one = self.excitation
         band = f", {one.band[0]:.2g} to {one.band[1]:.2g} Hz" if one.band else ""
         return f"{one.amplitude:.3g} V{band}, {one.duration:.3g} s"
 
 
 def recordings(amplitude: float, duration: float) -> list[Recording]:
-    """Return what is recorded of every robot."""
+    """Return the recordings that every robot needs."""
     return [
         Recording(folder, signal, Excitation(signal, lasts * duration, share * amplitude))
         for signal, share, lasts, folder in SIGNALS
@@ -98,8 +98,8 @@ def _open(estimate: Estimate) -> list[str]:
 class Schedule:
     """Parts that are done one after the other, and the time that is left.
 
-    Parts of a kind are late alike: what is left is what was planned and, for each part, by how
-    much the parts of its kind that are done took longer on average.
+    Parts of a kind are late alike: the time left is the planned one and, for each part, the mean
+    excess of the parts of its kind that are done.
 
     Examples
     --------
@@ -125,7 +125,7 @@ class Schedule:
         self._parts[name] = kind, seconds
 
     def add_further(self, one: Recording, wheels: int) -> None:
-        """Plan one more recording, and an identification behind it."""
+        """Plan one more recording, and an identification after it."""
         self.add(one.part, "signal", one.excitation.duration + START)
         self.add(AGAIN, "identify", COMPUTE * wheels)
 
@@ -162,7 +162,7 @@ def schedule(
     tuned: bool = False,
     tuning_page: bool = False,
 ) -> Schedule:
-    """Return the whole way of a commissioning, without what is done already."""
+    """Return the parts of a commissioning that are not done yet."""
     made = Schedule()
     for wheel in () if checked else wheels:
         made.add(f"checking {wheel}", "check", CHECK)

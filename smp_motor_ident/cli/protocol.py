@@ -1,4 +1,4 @@
-"""What a commissioning has found so far: written after every step, and what it stops at."""
+"""Findings of a commissioning: written after every step, with those that it stops at."""
 
 import contextlib
 import json
@@ -128,7 +128,7 @@ class Protocol:
         write_together(files, force=True)
 
     def results(self) -> page.Results:
-        """Return what is known of the wheels so far: drive, gains and motors."""
+        """Return drive, gains and motors as far as they are known."""
         if not self.has("identified"):
             return {}
         read = read_identification(self._folder / "identification")

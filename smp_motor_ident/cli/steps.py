@@ -63,7 +63,7 @@ class Robot:
 
 PATIENCE = 60.0  # how long a busy machine may take to start or end a process [s]
 TOPICS = "/(.*/)?(motor_.*|pid_state|wheel_setpoints|cmd_vel|odom|joint_states|diagnostics)"
-"""What is worth keeping of a robot, for ``record``."""
+"""Topics of a robot that ``record`` keeps."""
 
 
 def record(robot: Robot, name: str, *shown: str) -> Path:

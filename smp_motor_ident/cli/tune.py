@@ -6,7 +6,7 @@ from typing import Any
 
 from smp_motor_ident.cli import frame
 
-# Names of what is loaded only after the arguments are understood; a test holds them to it.
+# Names of modules' contents that load only after the arguments are parsed; a test compares them.
 METHODS = (
     "margin", "pole_placement", "simc", "ziegler_nichols", "tyreus_luyben", "relay",
 )  # fmt: skip
@@ -46,8 +46,8 @@ LOOP: dict[str, dict[str, Any]] = {
     "difference_window": dict(type=int, help="[samples]; else as identified"),
     "speed_noise": dict(type=float, help="of the reported speed, standard deviation "
                         "[rad/s, motor]; else as identified"),
-    "angle_noise": dict(type=float, help="of the angle that the speed is made from, beside counts, "
-                        "standard deviation [rad, motor]; else as identified"),
+    "angle_noise": dict(type=float, help="of the angle that the speed is made from, except of "
+                        "counts, standard deviation [rad, motor]; else as identified"),
     "gear_ratio": dict(type=float, help="else as identified"),
     "counts_per_revolution": dict(type=float, help="else as identified"),
     "supply": dict(type=float, help="[V]; else as identified"),
@@ -76,7 +76,11 @@ def parser() -> frame.Parser:
     p = frame.Parser(prog="tune", description=about, epilog=frame.OF_ROS)
     add = p.add_argument
     add("source", type=Path, nargs="?", help="identification.json, its folder, or motors.yaml")
-    add("--output", type=Path, help="parameter file to write; gains.json and a figure beside it")
+    add(
+        "--output",
+        type=Path,
+        help="parameter file to write; gains.json and a figure go to the same folder",
+    )
     add(
         "--export", choices=FORMATS, metavar="FORMAT",
         help="gains for a loop that others run, at its usual rate: " + ", ".join(FORMATS),

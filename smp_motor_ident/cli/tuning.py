@@ -58,7 +58,7 @@ def work(arguments: argparse.Namespace) -> int:
 def loop_for(
     estimate: Estimate, arguments: argparse.Namespace, measured: TransportDelay | None = None
 ) -> Loop:
-    """Return the loop of one wheel: what the user says, else what the bag knew."""
+    """Return the loop of one wheel from the user's arguments, else from the bag."""
     hardware, counts = estimate.hardware, estimate.hardware.counts_per_revolution
     supply = _first(arguments.supply, hardware.supply_voltage)
     if supply is None:
@@ -127,7 +127,7 @@ def _design(
 
 
 def _taking(text: str, seconds: float, wheels: Sized) -> str:
-    """Return what is done, and about how long it takes."""
+    """Return a step in words, with its duration."""
     return f"{text}, which takes about {seconds * len(wheels):.0f} s"
 
 
@@ -150,7 +150,7 @@ def _write(
     method = next(iter(wheels.designs.values())).method
     figure = tuning_svg(drawn, METHODS[method].required.sensitivity)
     write_together(dict(zip(files, (text, document, figure), strict=True)), arguments.force)
-    print(f"written: {files[0]}, beside it {files[1].name} and {files[2].name}")
+    print(f"written: {files[0]}, and with it {files[1].name} and {files[2].name}")
 
 
 def choose_sources(
@@ -207,7 +207,7 @@ def _files(arguments: argparse.Namespace) -> list[Path]:
 
 
 def read_estimates(source: Path) -> dict[str, Estimate]:
-    """Read what is to be tuned."""
+    """Read the motors to design for."""
     if source.suffix not in (".yaml", ".yml"):
         return read_identification(source)
     estimates = {}

@@ -13,16 +13,16 @@ from smp_motor_ident.result import Estimate, Quantity
 from smp_motor_ident.tune.verification import Change
 
 MOST_OVERSHOOT = 2.0  # percent of the change
-MOST_LATE = 20.0  # ms behind the prediction: four samples
+MOST_LATE = 20.0  # ms later than predicted: four samples
 MOST_GAIN_ERROR = 0.5  # percent
 MOST_DEVIATIONS = 3.0  # of its own standard deviations, for every parameter of a wheel
 WORST_DEVIATIONS = 4.0
-# Of 40 numbers, of which some 26 are independent, one lies beyond 3 by chance in one run of 15
+# Of 40 numbers, some 26 of them independent, one lies beyond 3 by chance in one run of 15
 # (and beyond 4 in one of 600): so one wheel may, and none may beyond 4.
 
 
 GAINS = ("p", "i", "d", "feedforward_static", "feedforward_velocity", "feedforward_acceleration")
-"""What is printed of a controller."""
+"""Parameters of a controller that are printed."""
 
 
 @dataclass(frozen=True)

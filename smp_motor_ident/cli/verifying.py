@@ -77,7 +77,7 @@ def drive(robot: steps.Robot, plan: Sequence[tuple[str, float, float]]) -> Path:
 def drive_undisturbed(
     robot: steps.Robot, designed: Designed, say: Callable[[str], None]
 ) -> tuple[list[Change], list[Finding]]:
-    """Drive until nothing but the wheels shows; return the changes, and what is to be said."""
+    """Drive until the computer did not disturb it; return the changes and the findings."""
     plan, namespace = plan_of(designed), str(robot.client.node.get_namespace()).rstrip("/")
     for left in reversed(range(ATTEMPTS)):
         say(f"driving on the new gains: {', '.join(name for name, *_ in plan)}")

@@ -29,7 +29,7 @@ COLUMNS = (
     ("velocity_ratio", "reported over counted speed"),
     ("rate", "samples per second"),
 )
-"""What the page shows of the test of the wheels."""
+"""Columns of the table of checks."""
 
 GAINS = (
     ("p", "V s/rad"),
@@ -39,7 +39,7 @@ GAINS = (
     ("feedforward_velocity", "V s/rad"),
     ("feedforward_acceleration", "V s²/rad"),
 )
-"""What the page shows of a controller, per wheel rad/s."""
+"""Parameters of a controller that the page shows, per wheel rad/s."""
 
 
 @dataclass(frozen=True)
@@ -52,7 +52,7 @@ class Row:
 
 
 Results = Mapping[str, Sequence[Row]]
-"""What a commissioning came to, in groups: drive, gains and motor."""
+"""Results of a commissioning in groups: drive, gains and motor."""
 
 
 def results(
@@ -147,7 +147,7 @@ def charts(changes: Sequence[Change]) -> list[Chart]:
 
 
 def _on(time: Array, own: Array, values: Array) -> Array:
-    """Return a curve at other instants, NaN behind its end."""
+    """Return a curve at other instants, NaN after its end."""
     return np.asarray(np.interp(time, own, values, right=np.nan))
 
 
@@ -157,7 +157,7 @@ def render(
     known: Results,
     parameters: str,
 ) -> str:
-    """Return the page of what ``commissioning.json`` holds, of motors, gains and drive."""
+    """Return the page of ``commissioning.json``, with motors, gains and drive."""
     findings = sorted(
         document.get("findings", []), key=lambda one: -SEVERITIES.index(one["severity"])
     )
@@ -169,7 +169,7 @@ def render(
         findings=[one for one in findings if one["severity"] != "note"],
         notes=[one for one in findings if one["severity"] == "note"],
         results=known,
-        # What comments tell of their origin stands in the file, and in the identification.
+        # Their origin, in comments, stands in the file.
         parameters="\n".join(x for x in parameters.splitlines() if not x.startswith("#")),
         checks=document.get("checks", {}),
         changes=document.get("changes", []),

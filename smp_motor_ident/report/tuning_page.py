@@ -51,7 +51,7 @@ class Choice:
 
 @dataclass(frozen=True, eq=False)
 class Tuning:
-    """What the page offers for one wheel."""
+    """The designs that the page offers for one wheel."""
 
     wheel: str  # name of the wheel
     # Margin after margin, the bandwidths of each in rising order; empty without a design
@@ -121,7 +121,7 @@ def page_charts(tunings: Mapping[str, Tuning]) -> list[Chart]:
 
 
 def page_data(tunings: Mapping[str, Tuning]) -> dict[str, Any]:
-    """Return what the page's script shows: by wheel the designs at every place of the sliders."""
+    """Return the data of the page's script: by wheel the designs at every place of the sliders."""
     return {
         "shares": SHARES,
         "margins": MARGINS,
@@ -157,7 +157,7 @@ def _document(one: Choice) -> dict[str, Any]:
 
 
 def _rows(found: Design) -> list[tuple[str, str, str]]:
-    """Return name, value and band of what the design keeps."""
+    """Return name, value and band of the design's figures."""
     bands, gains, settling = found.specification, found.gains, found.settling
     return [
         ("Crossover", f"{found.margins.crossover:.4g} rad/s", ""),

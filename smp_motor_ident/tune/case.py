@@ -49,23 +49,23 @@ COMMON = (
 
 @dataclass(frozen=True)
 class Case:
-    """One motor, one loop, one method: what is needed to judge and to finish a design."""
+    """One motor, one loop and one method, prepared to judge and to finish a design."""
 
     wheel: str  # whose motor
     method: Method  # the method that was asked for
     problem: Problem  # the nominal motor and the targets
-    required: RequiredMargins  # what the gains must keep
+    required: RequiredMargins  # margins that the gains must keep
     ensemble: UncertaintyEnsemble  # the motors that the data allow
     drawn: bool  # whether these were drawn; else the ensemble is the nominal motor alone
-    friction: Friction  # what is known of it
-    driver: Driver  # what its driver makes of a command
+    friction: Friction  # range of the dry friction
+    driver: Driver  # effects of its driver
     load: float  # that is always there, either way [V]
     torque_noise: float  # load that fluctuates, over a sample [V rms]
     scatter: float  # of the instants of commands and samples [s rms]
     eccentric: float  # amplitude of the encoder's error once a turn [rad]
     outliers: float  # share of the reported speed's readings
     lag_in_doubt: bool  # whether the second lag may be the reported speed's filter
-    findings: tuple[Finding, ...]  # what is to be said of the estimate
+    findings: tuple[Finding, ...]  # about the estimate
 
     @property
     def swallowed(self) -> float:
@@ -131,7 +131,7 @@ def prepare(estimate: Estimate, loop: Loop, method: str, targets: dict[str, Any]
 
 
 def _behind(driver: Driver, loop: Loop) -> Loop:
-    """Return a loop with what a driver takes of it: a ramp is late by half of its length.
+    """Return a loop with its driver's limits: a ramp is late by half of its length.
 
     The margins bear that; planned changes are no faster than the driver, and not late.
     """

@@ -30,21 +30,21 @@ from smp_motor_ident.tune.unmodelled import words as known_words
 
 @dataclass(frozen=True)
 class Design:
-    """Gains for one wheel, what they keep, and why they are as they are."""
+    """Gains for one wheel, their margins and the reason for them."""
 
     gains: PidGains  # of the running controller, per wheel rad/s
     margins: Margins  # of the nominal sampled loop
     reason: str  # in words for the user
     method: str  # name of it
-    loop: Loop  # what it was designed for
+    loop: Loop  # that it was designed for
     robustness: Robustness  # over the distribution of the estimate
     performance: Performance  # of the simulated loop
-    specification: Specification  # what the loop does over the distribution, in bands
+    specification: Specification  # bands over the distribution
     reference: Reference  # limits and duration of set-point changes, at the motor shaft
     motor: dict[str, float]  # combinations that it was designed from, at the motor shaft
-    sensor: dict[str, float]  # what the reported speed was identified to go through [s]
+    sensor: dict[str, float]  # averaging and lag of the reported speed, as identified [s]
     wheel: str = ""  # whose gains these are
-    findings: tuple[Finding, ...] = ()  # what the user should know beside
+    findings: tuple[Finding, ...] = ()  # warnings for the user
     feedback: Feedback = field(default_factory=lambda: Feedback(0.0, 0.0))
     breakaway: float = 0.0  # command at which the motor must turn [V]
     together: bool = False  # whether its reference is common to several wheels
@@ -108,7 +108,7 @@ def design(estimate: Estimate, loop: Loop, method: str = "margin", **targets: An
 
 
 def finish(case: Case, feedback: Feedback, factor: float, robustness: Robustness) -> Design:
-    """Add feed-forward, reference, figures and words to gains of which ``factor`` is left."""
+    """Add feed-forward, reference, figures and words to gains scaled by ``factor``."""
     problem, plant, loop = case.problem, case.problem.plant, case.problem.loop
     controller = controller_for(loop, feedback)
     margins = loop_margins(plant, feedback)
@@ -227,9 +227,9 @@ def _calmest(
 ) -> tuple[Reference, Performance, Specification]:
     """Return the reference, no quicker, whose stated settling is least, and its figures.
 
-    What is not known of a motor answers quick changes most: they take as long to settle as slower
-    ones, and overshoot more.  Of those that settle in as good as the least time, that is the one
-    that is stated to overshoot least.
+    Unknown dynamics answer quick changes most: these take as long to settle as slower ones, and
+    overshoot more.  Among those that settle in nearly the least time, the one that is stated to
+    overshoot least is taken.
     """
     tried = [(quickest, *figures(quickest))]
     most = (1 + AS_GOOD.value) * tried[0][2].settling.high  # NaN: nothing is tried
@@ -265,7 +265,7 @@ def _explain(
     unmodelled = case.problem.unmodelled
     if unmodelled is not None:
         words.append(
-            f"what the model may lack reaches {robustness.unmodelled:.0%} of what the loop bears"
+            f"unmodelled dynamics reach {robustness.unmodelled:.0%} of the loop's bound"
             + known_words(unmodelled, ": ")
         )
         # Beyond the crossover |T| is as large as the gains: so much of it the rule's had.
@@ -298,7 +298,7 @@ def _held_back(unmodelled: UnmodelledDynamics) -> Finding:
 
 
 def _sensor(case: Case) -> str:
-    """Return in words what the sensor that was identified does to the reported speed."""
+    """Return averaging and lag of the reported speed in words."""
     plant, words = case.problem.plant, ""
     if case.problem.loop.reports_speed and plant.motors.averaging_window[0] > 0 and plant.window:
         words += f", a speed averaged over {1e3 / plant.average[0, 0]:.3g} ms"

@@ -16,7 +16,7 @@ SHARE = 0.99
 
 @dataclass(frozen=True)
 class Robustness:
-    """What the gains do over the distribution of the estimate."""
+    """Stability and margins over the distribution of the estimate."""
 
     samples: int  # motors drawn; 0 where the estimate has no uncertainty
     stable: float  # share with a stable loop [0..1]
@@ -25,7 +25,7 @@ class Robustness:
     phase: float
     gain: float
     sensitivity: float
-    unmodelled: float = 0.0  # largest |T| W, of what the model may lack [-]; stable below 1
+    unmodelled: float = 0.0  # largest |T| W of unmodelled dynamics [-]; stable below 1
 
 
 class UncertaintyEnsemble:
@@ -46,7 +46,7 @@ class UncertaintyEnsemble:
         return batch_margins(loop, self.omega)
 
     def assess(self, feedback: Feedback) -> Robustness:
-        """Return what the gains do over the batch."""
+        """Return stability and margins over the batch."""
         m = self.margins(feedback)
         stable = spectral_radius(self.plant, feedback) < 1
         p = self.required

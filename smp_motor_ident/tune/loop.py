@@ -50,7 +50,7 @@ class Loop:
         Step in which a reported speed comes [rad/s, motor].
     angle_noise : float
         Standard deviation of the noise on the angle that the speed is made from [rad, motor],
-        beside quantisation.
+        in addition to quantisation.
     averaging_given : bool
         Whether ``difference_window`` holds for a reported speed whatever averaging was identified.
 
@@ -106,14 +106,14 @@ class Loop:
 
     @property
     def reported_noise(self) -> float:
-        """Noise of what is fed back [rad/s], beside quantisation: only a reported speed has any."""
+        """Noise of the speed that is fed back [rad/s], without quantisation; 0 unless reported."""
         return self.speed_noise if self.reports_speed else 0.0
 
     @property
     def rounding(self) -> float:
-        """Step [rad/s] of what is fed back, where its noise is little else.
+        """Step [rad/s] of the speed that is fed back, where rounding dominates its noise.
 
-        More noise makes a mean of what is rounded; a difference of counts is none of a speed.
+        More noise dithers the rounding; differenced counts are rounded as angles, not as speeds.
         """
         rounded = self.reports_speed and 3.0 * self.speed_noise < self.speed_step
         return self.speed_step if rounded else 0.0

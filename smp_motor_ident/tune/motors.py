@@ -18,10 +18,10 @@ from smp_motor_ident.tune.limits import (
 from smp_motor_ident.tune.loop import Loop
 
 SENSOR = ("delay", "averaging_window", "sensor_lag")
-"""What stands between the motor's speed and the one that is reported: [s] each."""
+"""Delays between the motor's speed and the reported one, in s each."""
 
 _ABSENT = (*SENSOR, "time_constant_product")
-"""What is nothing of a motor that is not said to have it."""
+"""Quantities that are zero where an estimate does not state them."""
 
 _POSITIVE = ("dc_gain", "time_constant", "resistance", "inductance", "motor_constant", "inertia")
 
@@ -57,13 +57,13 @@ class Motors:
 
 @dataclass(frozen=True)
 class Friction:
-    """What is known of dry friction, as a voltage."""
+    """Range of dry friction, as a voltage."""
 
     known: float  # what surely is there, which feed-forward may overcome [V]
-    # low, high: within what it lies [V]
+    # low, high: its range [V]
     low: float
     high: float
-    finding: Finding | None = None  # what is to be said of it
+    finding: Finding | None = None  # where the range is wide or unknown
 
     @property
     def planned(self) -> float:
@@ -72,7 +72,7 @@ class Friction:
 
 
 def friction_of(estimate: Estimate, supply: float) -> Friction:
-    """Return what feed-forward may take for known of dry friction."""
+    """Return the dry friction that feed-forward may rely on."""
     quantity = _static_voltage(estimate)
     if quantity is None:
         words = "dry friction was not identified: the feed-forward leaves it to the integral"
@@ -123,10 +123,10 @@ def draw_motors(
 ) -> Motors | None:
     """Draw motors from the distribution of the estimation error.
 
-    What is positive by nature is drawn log-normally, what may be zero normally from there up.
-    An unreliable estimate is drawn at least as wide as what it leaves unexplained.  A second lag
-    that the record hides is anything up to the first that it leaves open, and the motor anything
-    between the stated one and each of the alternatives that it leaves open, of which it may be any.
+    Positive quantities are drawn log-normally, quantities that may be zero normally and clipped
+    there.  An unreliable estimate is drawn at least as wide as its unexplained share.  A second lag
+    that the record hides is uniform over its range, and each motor is moved a random part of the
+    way to one of the alternatives that the record leaves open.
     """
     names = _names(estimate)
     mean = np.array([estimate.value(name) for name in names])
@@ -162,7 +162,7 @@ def draw_motors(
 def _towards_alternatives(
     estimate: Estimate, values: dict[str, Array], rng: np.random.Generator
 ) -> dict[str, Array]:
-    """Return draws of which each is moved a part of the way to an alternative, or to none."""
+    """Return draws, each moved a part of the way to an alternative, or to none."""
     if not estimate.alternatives:
         return values
     n = next(iter(values.values())).size
@@ -180,7 +180,7 @@ def _towards_alternatives(
 
 
 def _hidden_lag(estimate: Estimate) -> tuple[float, float] | None:
-    """Return within what a product of lags [s^2] lies that no value is stated of."""
+    """Return the range of a product of lags [s^2] that has no stated value."""
     product = estimate.combinations.get("time_constant_product")
     if product is None or product.value is not None or product.ci95 is None:
         return None
@@ -189,7 +189,7 @@ def _hidden_lag(estimate: Estimate) -> tuple[float, float] | None:
 
 
 def lag_of_sensor(estimate: Estimate) -> Finding | None:
-    """Return what is to be said where the second lag may be the reported speed's filter."""
+    """Return the finding where the second lag may be the reported speed's filter."""
     found = next((f for f in estimate.findings if f.code == "second_lag"), None)
     if found is None or found.severity != "warning":
         return None
@@ -260,7 +260,7 @@ def lag_in_sensor(motors: Motors) -> Motors:
 
 
 def every_other(motors: Motors, others: Motors) -> Motors:
-    """Return a batch of which every other motor is one of ``others``."""
+    """Return a batch in which every other motor is one of ``others``."""
     other = np.arange(len(motors)) % 2 == 1
     pairs = ((f.name, getattr(motors, f.name), getattr(others, f.name)) for f in fields(motors))
     return Motors(**{name: np.where(other, b, a) for name, a, b in pairs})

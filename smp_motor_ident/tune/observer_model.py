@@ -59,7 +59,7 @@ def observer_model(
     correct = np.array(gain)
     (F,), (G,) = prediction(model, np.array([sample_time]))
     size = correct.size
-    # Rows: what the innovation is made of.
+    # Coefficients of the innovation.
     innovation = np.concatenate([[1.0], -F[0, 1:]])
     advance = np.zeros((size, size))
     advance[0] = (1 - correct[0]) * innovation

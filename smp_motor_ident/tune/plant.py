@@ -98,7 +98,7 @@ class Plant:
         return self.transfer(z) - self._predicted(z)
 
     def _predicted(self, z: Complex) -> Complex:
-        """Return the transfer from controller output to what the observer adds, shape (f,)."""
+        """Return the transfer from controller output to the observer's own part, shape (f,)."""
         if self.observer is None:
             return np.zeros(z.size, dtype=np.complex128)
         delays = z[None, :] ** -np.arange(self.observer.taps.size)[:, None]

@@ -1,4 +1,4 @@
-"""What every tuning method is given: the sampled plant, its reductions and its noise."""
+"""The problem that every tuning method gets: the sampled plant, its reductions and its noise."""
 
 import math
 from collections.abc import Callable, Mapping
@@ -38,12 +38,12 @@ class FirstOrderDelay:
 
 @dataclass(frozen=True)
 class Problem:
-    """One motor in one loop, and what is asked of it."""
+    """One motor in one loop, with the targets of the design."""
 
     plant: Plant  # the sampled motor, a batch of one
     loop: Loop  # the loop that will run
-    targets: Mapping[str, Any] = field(default_factory=dict)  # what the caller asks of the method
-    unmodelled: UnmodelledDynamics | None = None  # what the motor may do beside its model
+    targets: Mapping[str, Any] = field(default_factory=dict)  # targets of the caller
+    unmodelled: UnmodelledDynamics | None = None  # error bound of the model
     shaking: float = 1.0  # of the speed, by noise, that is allowed: times the usual limit
 
     @cached_property
@@ -77,7 +77,7 @@ class Problem:
         return control, 1 / (1 + control * self.response)
 
     def unmodelled_gain(self, feedback: Feedback) -> float:
-        """Return the largest ``|T| W``: below 1 what the model may lack cannot destabilise."""
+        """Return the largest ``|T| W``: below 1 unmodelled dynamics cannot destabilise."""
         control, sensitivity = self.closed(feedback)
         return float(np.abs(control * self.uncertain * sensitivity).max())
 
@@ -160,9 +160,9 @@ class Method:
     name: str
     title: str
     source: str
-    required: RequiredMargins  # what its gains keep; scaled back where the rule alone would not
+    required: RequiredMargins  # kept by scaling the rule's gains back where needed
     solve: Callable[[Problem], Feedback]  # from the problem to the feedback gains
-    targets: tuple[str, ...] = ()  # keywords that it understands beside the common ones
+    targets: tuple[str, ...] = ()  # keywords that it understands in addition to the common ones
 
 
 def measured_lag(plant: Plant, delay: float) -> float:

@@ -103,7 +103,7 @@ class Change:
 
 
 def planned_change(plant: Plant, plan: Reference, distance: float, time: Array) -> Change:
-    """Return what the running loop makes of a change of set-point from rest."""
+    """Return the running loop's plan for a change of set-point from rest."""
     m, T = plant.motors, plant.sample_time
     profile = plan.profile()
     profile.set_target(distance, T)

@@ -6,7 +6,7 @@ A mass on a spring makes of a motor's response G the response ``G (1 + D)`` with
 
 m being -1 where the speed is the mass's, and the ratio of its inertia to the rotor's where it is
 the rotor's.  For every w, and the dampings z of shafts, the largest m of either sign up to 1 is
-taken with which ``|D|`` is nowhere above the bound of what the model may lack.  A loop that answers
+taken with which ``|D|`` is nowhere above the bound of unmodelled dynamics.  A loop that answers
 with y where the motor is G is off by
 
     E = D S Y / (1 + D T),
@@ -32,13 +32,13 @@ from smp_motor_ident.tune.simulation import settling_time
 from smp_motor_ident.tune.unmodelled import UnmodelledDynamics
 
 COUNT = 40
-"""Frequencies of resonances, from the lowest of which the bound speaks up to Nyquist."""
+"""Number of resonance frequencies, from the lowest of the bound up to Nyquist."""
 
 DAMPINGS = np.geomspace(RESONANCE_DAMPING.value, RESONANCE_DAMPED.value, 4)
 """Of resonances, evenly spread over those of shafts."""
 
 SHORTEST, LONGEST = 2**13, 2**16
-"""Samples over which a resonance is followed, of which feedback may take damping."""
+"""Samples over which a resonance is followed; feedback may reduce its damping."""
 
 
 def added_by_resonance(
@@ -83,7 +83,7 @@ def mode(omega: Array, at: Array, damping: float, sample_time: float) -> Complex
 
 
 def largest(unmodelled: UnmodelledDynamics, at: Array, damping: float, sample_time: float) -> Array:
-    """Return the largest m, up to 1, of modes of which the bound allows all of the response."""
+    """Return the largest m, up to 1, for which modes stay within the bound."""
     ends = unmodelled.frequency[0], np.pi / sample_time
     omega = np.union1d(np.geomspace(*ends, 10 * COUNT), at)
     size = np.abs(mode(omega, at, damping, sample_time))

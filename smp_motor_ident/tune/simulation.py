@@ -37,7 +37,7 @@ class Controller:
 
 @dataclass(frozen=True, eq=False)
 class Response:
-    """What the loop did; arrays of shape (n, k) at the sampling instants."""
+    """Response of the loop; arrays of shape (n, k) at the sampling instants."""
 
     speed: Array  # shape (n, k), [rad/s]: true speed of the motor
     voltage: Array  # shape (n, k), [V]: output of the controller
@@ -47,14 +47,14 @@ class Response:
 
 @dataclass(frozen=True, eq=False)
 class Inputs:
-    """What comes into the loop at the sampling instants, each of shape (k,)."""
+    """Inputs of the loop at the sampling instants, each of shape (k,)."""
 
     # low, high: [rad/s]: between which the measurement is left alone; one reference where there is
     # no ``high``
     low: Array
     high: Array | None = None
     forward: Array | None = None  # [V]: Feed-forward
-    load: Array | None = None  # [V]: what a load takes, shape (k,) or (n, k)
+    load: Array | None = None  # [V]: of a load, shape (k,) or (n, k)
     noise: Array | None = None  # [rad/s]: on the measured speed, shape (n, k)
     angle_noise: Array | None = None  # [rad]: on the angle that it is made from, shape (n, k)
 
@@ -85,7 +85,7 @@ def simulate(
 
     A speed is reported in steps of ``speed_step`` [rad/s]; ``eccentric`` [rad] is the amplitude of
     an encoder's error once a turn of the motor.
-    The driver stands between what the controller puts out, which the observer knows, and the motor.
+    The driver stands between the controller's output, which the observer knows, and the motor.
     """
     n, steps, fb = len(plant), inputs.low.size, controller.feedback
     numbers = (fb.p, fb.i, fb.d, fb.filter_time, controller.weight, controller.weight_d,
@@ -137,7 +137,7 @@ def _rounded(speed: float, step: float) -> float:
 
 @compiled
 def _drag(speed: float, friction: float, past: Array, reach: Array, load: float) -> float:
-    """Return what dry friction takes over a sample [V]: at rest, of what pushes, all it can."""
+    """Return the voltage of dry friction over a sample [V]; at rest it cancels what pushes."""
     if speed != 0.0 or friction == 0.0:
         return float(friction * np.sign(speed))
     pushed = 0.0

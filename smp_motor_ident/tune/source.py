@@ -19,7 +19,7 @@ from smp_motor_ident.tune.feedback import Feedback
 from smp_motor_ident.tune.loop import Loop
 
 WINDOWS = (2, 4, 8, 16)
-"""Samples to difference over that are tried beside what the hardware reports."""
+"""Samples to difference over that are tried in addition to the reported speed."""
 
 WORTH_WINDOW, WORTH_OBSERVER = 1.15, 1.5
 """How many times better a load must be rejected for a longer window, and for the observer, which
@@ -30,7 +30,7 @@ DRAWS = 200
 
 @dataclass(frozen=True)
 class Trial:
-    """What one source allows."""
+    """Gains that one source allows."""
 
     loop: Loop  # with the source
     case: Case  # the motor in that loop
@@ -144,7 +144,7 @@ def _averaged(estimate: Estimate, loop: Loop, usual: Trial | None, targets: dict
 
 
 def _lacking(estimate: Estimate) -> str:
-    """Return in words why the model is not to be leaned on: its error shows what it lacks.
+    """Return in words why the observer is not taken: the model's error shows unmodelled dynamics.
 
     That may move no number, and still be what rings between motor and encoder.
     """

@@ -32,7 +32,7 @@ from smp_motor_ident.tune.simulation import (
 
 @dataclass(frozen=True)
 class Performance:
-    """What the simulated loop does; speeds at the motor shaft."""
+    """Figures of the simulated loop; speeds at the motor shaft."""
 
     # rise, settling: of a set-point step through the reference [s]: 10 to 90 %, and until within
     # 2 %
@@ -51,7 +51,7 @@ class Performance:
 
 @dataclass(frozen=True)
 class Band:
-    """A figure of the nominal loop, and what 99 % of the motors that may be keep to either side."""
+    """A figure of the nominal loop, and the range of 99 % of the motors that may be."""
 
     # value, low, high: NaN where there is none, such as a settling time of a loop that does not
     # settle
@@ -62,11 +62,11 @@ class Band:
 
 @dataclass(frozen=True)
 class Specification:
-    """What the loop does to a change of set-point from rest, and its margins, in bands.
+    """Bands of the answer to a change of set-point from rest, and of the margins.
 
     Simulated with counts, dry friction and the usual delay, over draws of all that the estimate
-    leaves open, and with what a resonance adds that the recording does not exclude; the margins
-    bear the longest delay.
+    leaves open, plus the effect of resonances that the recording does not exclude; the margins bear
+    the longest delay.
     """
 
     samples: int  # motors that the bands are over; 0 where the estimate has no uncertainty
@@ -81,7 +81,7 @@ class Specification:
 
 @dataclass(frozen=True)
 class Settling:
-    """When a change of set-point from rest has settled, and what that figure includes."""
+    """Settling of a change of set-point from rest, with the parts that the figure includes."""
 
     value: float  # of the motor as identified [s]
     high: float  # 99 % of the motors that the data allow [s]
@@ -181,7 +181,7 @@ def _runs(
 
 
 def _counted(plant: Plant, nominal: Plant) -> NDArray[np.bool_]:
-    """Tell of which motors the measured speed is made from counts in the running loop.
+    """Tell for each motor whether the running loop's speed is made from counts.
 
     A filter's is not, nor that of an alternative with a window so much shorter than the nominal
     one's: what counts make of it would have been seen.
@@ -192,7 +192,7 @@ def _counted(plant: Plant, nominal: Plant) -> NDArray[np.bool_]:
 
 
 def _load(case: Case, friction: Array, shape: tuple[int, int]) -> Array:
-    """Return what a load takes beyond the voltage with which the wheel stood before the change.
+    """Return the load beyond the voltage with which the wheel stood before the change [V].
 
     That is up to what friction holds, or as much as it may hold it with too little or too much.
     """
@@ -233,7 +233,7 @@ def _reported_noise(case: Case, loop: Loop, shape: tuple[int, int]) -> Array | f
 def _performance(
     problem: Problem, feedback: Feedback, time: Array, planned: StepFigures, control_noise: float
 ) -> Performance:
-    """Add what the feedback alone does, small, so that saturation does not hide the loop."""
+    """Add figures of the feedback alone, by a change so small that nothing saturates."""
     alone = Controller(feedback)
     run = simulate(problem.plant, alone, Inputs(np.ones(time.size)))
     abrupt = step_figures(time, run.speed[0], run.voltage[0], 1.0)

@@ -1,4 +1,4 @@
-r"""What the model may lack, as a bound over frequency that the loop must bear.
+r"""Unmodelled dynamics as a bound over frequency that the loop must bear.
 
 A motor whose response is ``G (1 + D)`` with ``|D(j w)| <= W(j w)`` keeps a loop stable that is
 stable with ``G``, if

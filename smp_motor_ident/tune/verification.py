@@ -1,4 +1,4 @@
-"""A drive on new gains against what the design said of it: every change of set-point, in bands.
+"""A drive on new gains against the design's bands, for every change of set-point.
 
 The prediction is the running loop itself on simulated motors: the nominal one and draws of all
 that the estimate leaves open, seen through the same encoder and read in the same way.
@@ -41,7 +41,7 @@ STEADY = 0.3
 """End of a change that is taken as steady [s]."""
 
 DRAWS = 12
-"""Motors beside the nominal one."""
+"""Motors in addition to the nominal one."""
 
 UNKNOWN = 0.1
 """Of the samples whose voltage may be no command's: one that changed within an interval."""
@@ -80,7 +80,7 @@ class Change:
     high: Array  # largest of the predictions [rad/s]
     reading: Reading  # of the measured speed
     expected: Reading  # of the motor as identified, with this drive's own samples
-    bands: Reading  # what it may be at most, with what its record cannot resolve
+    bands: Reading  # largest values allowed, with the record's resolution added
     tolerance: float  # within which both count as settled [share of the change]
     excess: float  # overshoot of the nominal motor beyond the design's [% of the change]
 
@@ -295,7 +295,7 @@ def slow_answers(changes: Sequence[Change]) -> list[Finding]:
 
 
 def disturbed(silence: float) -> list[Finding]:
-    """Return what is said of a drive in which a wheel was without control for a while [s]."""
+    """Return the finding where a wheel was without control for a while [s]."""
     if silence <= SILENCE.value:
         return []
     evidence = {"silence": silence, "limit": SILENCE.value}
@@ -310,7 +310,7 @@ def loop_settings(parameters: Mapping[str, Any]) -> LoopSettings:
 
 
 def _motors(estimate: Estimate, supply: float) -> list[MotorEntry]:
-    """Return the nominal motor and draws of what the estimate leaves open."""
+    """Return the nominal motor and draws of the estimate's uncertainty."""
     nominal = motors_of(estimate)
     drawn = draw_motors(estimate, DRAWS, np.random.default_rng(0))
     hardware = estimate.hardware

@@ -4,15 +4,18 @@ from __future__ import annotations
 
 import json
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pytest
 from wheel_simulation import Timing, simulate_closed_loop
 
 from smp_motor_control.motor.file import load_motors, paper_motors
 from smp_motor_control.motor.hardware import DriveSettings
 from smp_motor_ident.bag.storage import Table
 from smp_motor_ident.cli import driving, tune
+from smp_motor_ident.cli.processes import ProcessError
 from smp_motor_ident.cli.tuning import read_estimates
 from smp_motor_ident.tune import verification
 
@@ -63,3 +66,9 @@ def test_a_drive_settles_when_tune_says(tmp_path: Path) -> None:
     late = driving.Driven(table(run.time + 0.1, **state.columns), answers)
     (behind, *_), _ = driving.changes_of(WHEEL, late, moves, given)
     assert behind.reading.settling - stated["value"] > 0.05
+    # A clock that was set before the drive ended: a line, and no memory for the years between.
+    early = np.where(run.time < 0.5, 0.0, 1.7e9) + run.time
+    torn = driving.Driven(table(early, **state.columns), table(early, **answers.columns))
+    wide = [replace(one, begin=one.begin + 1.7e9) for one in moves]
+    with pytest.raises(ProcessError, match="a clock was set"):
+        driving.changes_of(WHEEL, torn, wide, given)

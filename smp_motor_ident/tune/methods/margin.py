@@ -30,7 +30,7 @@ MORE_NOISE, ENOUGH, NO_SOFTER = 8, 1.2, 1.0
 wheel by, may be raised, until the integral gain is so many times that of SIMC."""
 
 PEAK = {"balanced": 1.25, "tracking": 1.05, "load": math.inf}
-"""Largest peak of the complementary sensitivity, by what the design is for."""
+"""Largest peak of the complementary sensitivity, by focus."""
 
 
 _Found = tuple[Feedback, float]
