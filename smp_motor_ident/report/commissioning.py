@@ -76,6 +76,7 @@ def results(
 def _motor(estimates: Mapping[str, Estimate]) -> Iterator[Row]:
     """Return every number that the records tell, with the digits that its scatter allows."""
     held = [{**one.combinations, **one.parameters} for one in estimates.values()]
+    alike: dict[tuple[str, ...], list[str]] = {}  # names by their systematic uncertainties
     for name in dict.fromkeys(name for one in held for name in one):
         found = [one.get(name, Quantity(None)) for one in held]
         if any(one.value is not None for one in found):
@@ -83,7 +84,9 @@ def _motor(estimates: Mapping[str, Estimate]) -> Iterator[Row]:
             yield Row(words.label(name), words.typeset(unit), tuple(map(_stated, found)))
         if any(one.systematic for one in found):
             cells = tuple(words.systematic(one) for one in found)
-            yield Row(f"{words.label(name)}, systematic", "", cells)
+            alike.setdefault(cells, []).append(words.label(name).lower())
+    for cells, names in alike.items():
+        yield Row(f"Systematic, of {', '.join(names)}", "", cells)
 
 
 def _stated(quantity: Quantity) -> str:

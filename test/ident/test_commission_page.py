@@ -42,9 +42,8 @@ def passed(tmp_path: Path) -> Path:
     estimates = {wheel: estimate(wheel) for wheel in WHEELS}
     scale = (Share("current_scale", 0.03, 0.39),)
     first = estimates[WHEELS[0]]
-    resistance = replace(first.parameters["resistance"], systematic=scale)
-    held = {**first.parameters, "resistance": resistance}
-    estimates[WHEELS[0]] = replace(first, parameters=held)
+    held = {n: replace(first.parameters[n], systematic=scale) for n in ("resistance", "inductance")}
+    estimates[WHEELS[0]] = replace(first, parameters={**first.parameters, **held})
     (tmp_path / "identification").mkdir()
     text = to_json(identification_document(estimates))
     (tmp_path / "identification" / "identification.json").write_text(text)
@@ -87,7 +86,7 @@ def test_page_opens_with_motors_and_gains_then_yaml_then_the_drive(
         assert rows["p V s/rad"] == ["2.675"] * 4 and rows["i V/rad"] == ["87.97"] * 4
         assert rows["DC gain rad/s/V"] == ["25.50 ± 0.1"] * 4
         assert rows["Resistance Ω"] == ["12.92 ± 0.13"] * 4  # systematic errors stand apart
-        assert rows["Resistance, systematic"][0] == "± 3 % (current scale)"
+        assert rows["Systematic, of resistance, inductance"][0] == "± 3 % (current scale)"
         assert rows["Settles, designed at most ms"] == ["150"] * 4
         assert rows["Settles, driven ms"] == ["149"] * 4
         # What is copied is the parameter file.
