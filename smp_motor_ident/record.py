@@ -88,6 +88,8 @@ class Record:
     velocity_window : float
         Length [s] of the trailing window over which ``velocity`` is known to be averaged;
         0 where it is instantaneous or unknown.
+    recorded : float or None
+        When the recording began [s since 1970], by its own stamps; None where they do not tell.
 
     Raises
     ------
@@ -108,6 +110,7 @@ class Record:
     source: str = ""
     findings: tuple[Finding, ...] = ()
     velocity_window: float = 0.0
+    recorded: float | None = None
 
     def __post_init__(self) -> None:
         where = f"{self.source or 'record'}: {self.wheel}"

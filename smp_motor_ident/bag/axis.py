@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from smp_motor_control.arrays import Array, Flags, Integers
-from smp_motor_ident.bag.clock import BEATS, mean_held, rhythm
+from smp_motor_ident.bag.clock import BEATS, mean_held, recorded_at, rhythm
 from smp_motor_ident.bag.counter import Unwrapped, angle_resets, reset_found, unwrap
 from smp_motor_ident.bag.drives import answers_in_its_row
 from smp_motor_ident.bag.mapping import MotorMap
@@ -102,6 +102,7 @@ def on_one_axis(motor: Motor, series: dict[str, Series], axis_name: str) -> Reco
         source=motor.source,
         findings=tuple(f for k, f in enumerate(motor.findings) if f not in motor.findings[:k]),
         velocity_window=motor.plan.velocity_window,
+        recorded=recorded_at(motor.tables[topic].logged for topic in motor.plan.topics),
         **columns,
     )
 

@@ -1,6 +1,6 @@
 """Time done right: which clock, in what order, where gaps are, and inputs held over intervals."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Any
@@ -30,6 +30,15 @@ BEATS = 32
 """Samples by which a beat is judged."""
 SAME_CLOCK = 50_000_000
 """Clocks of two topics whose offsets differ by less [ns] are one clock: latency explains it."""
+
+SET = 1_000_000_000_000_000_000
+"""A time [ns] from 2001 on is of a clock that was set; a smaller one counts from some start."""
+
+
+def recorded_at(logs: Iterable[Integers]) -> float | None:
+    """Return the first time of a clock that was set [s since 1970], None where there is none."""
+    first = [int(log[log >= SET].min()) for log in logs if (log >= SET).any()]
+    return 1e-9 * min(first) if first else None
 
 
 def nanoseconds(column: NDArray[Any], signal: Signal, unit: str) -> Integers:

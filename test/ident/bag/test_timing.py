@@ -359,3 +359,15 @@ def test_what_only_some_recordings_have_stays_known_where_it_is(
     np.testing.assert_array_equal(joined.current[:20], record.current)
     assert np.isnan(joined.current[20:]).all()
     assert np.all(np.diff(joined.time) > 0)
+
+
+def test_a_recording_knows_when_it_began_where_its_clock_was_set(
+    tmp_path: Path, corpus: SimpleNamespace
+) -> None:
+    truth = corpus.motion()
+    (record,) = read_records(corpus.write_mcap(tmp_path / "a.mcap", truth.messages())).values()
+    assert record.recorded == pytest.approx(1e-9 * corpus.START, abs=1.0)
+    # A computer without a battery begins at 1970: that is no date.
+    early = replaced(truth, time=truth.time - corpus.START)
+    (record,) = read_records(corpus.write_mcap(tmp_path / "b.mcap", early.messages())).values()
+    assert record.recorded is None
