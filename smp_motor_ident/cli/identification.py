@@ -25,7 +25,7 @@ from smp_motor_ident.errors import BagError, InsufficientExcitationError, Parame
 from smp_motor_ident.estimate import estimate
 from smp_motor_ident.estimation.simulation import simulate
 from smp_motor_ident.record import Record
-from smp_motor_ident.report import figures, history, words
+from smp_motor_ident.report import figures, history, summary, words
 from smp_motor_ident.report.document import (
     check_free,
     identification_document,
@@ -52,6 +52,7 @@ class Outcome:
     estimate: Estimate | None = None
     comparisons: tuple[figures.Comparison, ...] = ()
     failure: SmpError | None = None
+    recorded: tuple[float, ...] = ()  # when its recordings began [s since 1970]
 
     @property
     def exit_code(self) -> int:
@@ -179,7 +180,8 @@ def identify_wheel(
         for role, part in parts.items()
         for one in part
     ]
-    return Outcome(found, tuple(compared))
+    recorded = tuple(r.recorded for r in (*records, *kept) if r.recorded is not None)
+    return Outcome(found, tuple(compared), recorded=recorded)
 
 
 def _tunings(outcomes: Mapping[str, Outcome], say: Callable[..., None]) -> dict[str, Tuning]:
@@ -214,8 +216,10 @@ def _contents(
     from smp_motor_ident.report.html import Report, render
 
     date = now()
+    recorded = sorted({words.date(t) for outcome in outcomes.values() for t in outcome.recorded})
     provenance = {
         "Recordings": ", ".join(Path(path).name for path in arguments.bags),
+        "Recorded": ", ".join(recorded),
         "Judged by": ", ".join(Path(path).name for path in arguments.validate)
         or "parts of the same recordings that were held out",
         "Command": arguments.command,
@@ -233,6 +237,7 @@ def _contents(
         provenance,
         tunings,
         {wheel: history.history_charts(wheel, entries) for wheel, entries in since.items()},
+        arguments.output,
     )
     head = [f"Identified {date} by {NAME} from {provenance['Recordings']}.", "SI, motor shaft."]
     document = to_json(identification_document(estimates))
@@ -244,41 +249,37 @@ def _conclude(
 ) -> int:
     """Print what came out; return the exit code."""
     estimates = {wheel: one.estimate for wheel, one in outcomes.items() if one.estimate}
-    if not arguments.quiet:
+    if not arguments.quiet and estimates:
+        out = tables.console()
         for found in estimates.values():
-            _print(found, arguments)
-        if estimates:
-            tables.console().print(f"written: {', '.join(map(str, paths))}", soft_wrap=True)
+            tables.print_estimate(out, found, arguments.verbose)
+            if arguments.what_next:
+                text = what_next(found, arguments.accuracy).words
+                out.print(f"Next: {words.to_sentence(text)}", soft_wrap=True)
+            out.print()
+        out.print(f"written: {', '.join(map(str, paths))}", soft_wrap=True)
+        advice = (summary.advise_tuning(one, arguments.output) for one in estimates.values())
+        for text, command in dict.fromkeys(advice):
+            out.print(f"{text} {command}", soft_wrap=True)
     code = 0
     for wheel, one in outcomes.items():
         if one.failure:
             print(f"{NAME}: {one.failure}", file=sys.stderr)
         elif one.exit_code and not arguments.accept_unreliable:
-            print(f"{NAME}: {wheel}: {_what_is_unreliable(estimates[wheel])}", file=sys.stderr)
+            print(f"{NAME}: {wheel}: {_tell_unreliable(estimates[wheel])}", file=sys.stderr)
         else:
             continue
         code = max(code, one.exit_code)
     return code
 
 
-def _print(found: Estimate, arguments: argparse.Namespace) -> None:
-    out = tables.console()
-    out.print(tables.estimate_table(found))
-    for finding in words.findings(found):
-        out.print(f"{finding.severity}: {finding.message}", soft_wrap=True)
-        if finding.advice:
-            out.print(f"advice: {finding.advice}", soft_wrap=True)
-    if arguments.what_next:
-        out.print(f"next: {what_next(found, arguments.accuracy).words}", soft_wrap=True)
-    out.print()
-
-
-def _what_is_unreliable(found: Estimate) -> str:
-    """Return the codes of the gravest findings, which the report tells, and what to record next."""
+def _tell_unreliable(found: Estimate) -> str:
+    """Return which numbers are unreliable and what to record next, in one line."""
     grave = [f for f in found.findings if f.severity in ("unreliable", "refused")]
     codes = ", ".join(dict.fromkeys(f.code for f in grave))
-    advice = dict.fromkeys(f.advice.rstrip(".") for f in grave if f.advice)
-    return "; ".join([f"unreliable: {codes}", *advice, "--accept-unreliable takes it as it is"])
+    advice = dict.fromkeys(words.to_sentence(f.advice) for f in grave if f.advice)
+    first = f"{summary.judge(found)[1]} ({codes})."
+    return " ".join([first, *advice, "--accept-unreliable takes it as it is."])
 
 
 _SETPOINT = re.compile(r"(^|\s|\.)setpoint=")

@@ -59,6 +59,7 @@ def parser() -> Parser:
     add("--tuning", action="store_true", help="add the tuning page to the report (takes longer)")
     add("--what-next", action="store_true", help="propose the next recording")
     add("--accuracy", type=number(0, 1), default=0.01, help="wanted by --what-next; default 0.01")
+    add("--verbose", "-v", action="store_true", help="print every finding, notes too")
     add("--quiet", "-q", action="store_true", help="print errors only")
     return made
 

@@ -11,16 +11,16 @@ from rich.text import Text
 
 from smp_motor_ident import bag
 from smp_motor_ident.cli.frame import progress
-from smp_motor_ident.report import words
+from smp_motor_ident.report import summary, words
 from smp_motor_ident.result import Estimate
 
 MOST_FIELDS = 12  # so many fields of a topic are printed
-_COLOR = {"estimated": "green", "fixed": "cyan", "unidentifiable": "red"}
+_COLOR = {"good": "green", "fair": "yellow", "poor": "red"}
 
 
 def console() -> Console:
     """Return the console of standard output; wide enough for a table when it is no terminal."""
-    return Console(width=None if sys.stdout.isatty() else 110, highlight=False, markup=False)
+    return Console(width=None if sys.stdout.isatty() else 140, highlight=False, markup=False)
 
 
 def table(title: str, *columns: str) -> Table:
@@ -32,29 +32,44 @@ def table(title: str, *columns: str) -> Table:
     return made
 
 
-def estimate_table(estimate: Estimate) -> Table:
-    """Return what is known of one motor."""
-    fit = estimate.fit_percent
-    title = [f"{words.label(estimate.wheel)}: {words.model(estimate.model)}"]
-    if fit.estimation is not None:
-        title.append(f"fit {fit.estimation:.2f} %")
-    if fit.validation is not None:
-        title.append(f"held out {fit.validation:.2f} %")
-    apart = ["systematic"] if estimate.systematic else []
-    columns = ("quantity", "value", "std", "95 % interval", "unit", *apart, "status")
-    made = table(", ".join(title), *columns)
-    for column in made.columns[4:]:
+def print_estimate(out: Console, estimate: Estimate, verbose: bool = False) -> None:
+    """Print one motor as the report has it: verdict, numbers, and the gravest messages, or all."""
+    grade, verdict = summary.judge(estimate)
+    title = f"{words.label(estimate.wheel)}: {words.model(estimate.model)}"
+    out.print(title, style="bold", soft_wrap=True)
+    out.print(Text(f"{verdict}.", style=_COLOR[grade]), summary.describe_fit(estimate))
+    out.print(_values(estimate))
+    shown, other = summary.select_messages(estimate)
+    for one in (*shown, *other) if verbose else shown:
+        text = f"{one.number}. {one.severity.capitalize()}: {one.text} {one.advice}".rstrip()
+        out.print(text, soft_wrap=True)
+    if other and not verbose:
+        more = f"{len(other)} more finding{'s' if len(other) > 1 else ''}"
+        out.print(f"{more}: in the report, or with --verbose.")
+
+
+def _values(estimate: Estimate) -> Table:
+    """Return the numbers and ranges that are known of a motor."""
+    held = {**estimate.combinations, **estimate.parameters}
+    doubted = summary.find_doubted(estimate)
+    made = table("", "quantity", "value", "95 % interval", "systematic")
+    for column in made.columns:
         column.justify = "left"
-    for name, quantity in {**estimate.combinations, **estimate.parameters}.items():
-        made.add_row(
-            name,
-            words.number(quantity.value, quantity.std),
-            words.spread(quantity.std),
-            words.interval(quantity),
-            quantity.unit,
-            *(words.systematic(quantity) for _ in apart),
-            Text(words.status(quantity), style=_COLOR[quantity.status]),
-        )
+    made.columns[3].no_wrap = False
+    for name, quantity in held.items():
+        if words.is_told(quantity):
+            remark = [words.systematic(quantity)]
+            if quantity.status != "estimated":
+                remark.append(words.status(quantity))
+            if name in doubted:
+                remark.append(f"unreliable, see {doubted[name]}")
+            interval = "" if quantity.value is None else words.interval(quantity)
+            text = ", ".join(filter(None, remark))
+            made.add_row(words.label(name), words.state(quantity), interval, text)
+    hidden = [words.put_within(n) for n, q in held.items() if not words.is_told(q)]
+    if hidden:
+        made.caption = f"not identifiable: {', '.join(hidden)}"
+        made.caption_justify = "left"
     return made
 
 

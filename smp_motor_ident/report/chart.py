@@ -40,6 +40,7 @@ class Chart:
     spans: tuple[tuple[float, float, str], ...] = ()
     group: str = ""  # charts of one group share cursor and zoom in x
     height: int = 220
+    view: tuple[float, float] | None = None  # stretch of x that a screen shows at first
     summary: str = ""  # what the chart shows, for those who cannot see it
 
 

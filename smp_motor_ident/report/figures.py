@@ -12,6 +12,7 @@ from smp_motor_ident.report.words import label
 from smp_motor_ident.result import ResidualTests
 
 POINTS = 8000  # of a curve over time; zoomed in tenfold that is still one a pixel
+VIEW = 80.0  # lags of the motor that a screen shows at first: single answers are seen there
 COHERENT = 0.6
 """Below this coherence most of what a frequency shows is not the answer to the voltage."""
 
@@ -32,8 +33,11 @@ class Comparison:
     simulated: Array
 
 
-def fit_charts(wheel: str, parts: Sequence[Comparison]) -> list[Chart]:
-    """Return speed, residual and voltage over all stretches of data, one after the other."""
+def fit_charts(wheel: str, parts: Sequence[Comparison], lag: float = 0.0) -> list[Chart]:
+    """Return speed, residual and voltage over all stretches of data, one after the other.
+
+    A screen shows at first where the speed moves most, over many of the motor's lags [s].
+    """
     begin, times, spans = 0.0, [], []
     for part in parts:
         times.append(begin + part.time)
@@ -45,13 +49,13 @@ def fit_charts(wheel: str, parts: Sequence[Comparison]) -> list[Chart]:
     simulated = np.concatenate([part.simulated for part in parts])
     voltage = np.concatenate([part.voltage for part in parts])
     keep = np.union1d(thin(measured, POINTS // 2), thin(simulated, POINTS // 2))
-    name = label(wheel)
+    name, view = label(wheel), _liveliest(time, measured, spans, VIEW * lag)
 
     def chart(kind: str, y_label: str, height: int, *curves: Curve) -> Chart:
         return Chart(
             name=f"{kind}-{wheel}", title=f"{name}: {kind}", x_label="time [s]", y_label=y_label,
             x=time[keep], curves=curves, spans=tuple(spans), group=wheel, height=height,
-            summary=f"{kind.capitalize()} of {name} over {time[-1]:.1f} s.",
+            view=view, summary=f"{kind.capitalize()} of {name} over {time[-1]:.1f} s.",
         )  # fmt: skip
 
     speeds = (
@@ -64,6 +68,20 @@ def fit_charts(wheel: str, parts: Sequence[Comparison]) -> list[Chart]:
         chart("residual", "residual [rad/s]", 180, residual),
         chart("voltage", "voltage [V]", 180, Curve("voltage", voltage[keep], "voltage")),
     ]
+
+
+def _liveliest(
+    time: Array, speed: Array, spans: Sequence[tuple[float, float, Role]], length: float
+) -> tuple[float, float] | None:
+    """Return the stretch of held-out data, else of any, in which the speed scatters most."""
+    begin, end, _ = max(spans, key=lambda span: (span[2] == "validation", span[1] - span[0]))
+    if not 0.0 < length < end - begin:
+        return None
+    starts = np.arange(begin, end - 0.99 * length, length)
+    inside = [speed[(time >= first) & (time < first + length)] for first in starts]
+    spread = [float(np.nanstd(part)) if np.isfinite(part).any() else 0.0 for part in inside]
+    first = float(starts[int(np.argmax(spread))])
+    return first, first + length
 
 
 def residual_charts(wheel: str, tests: ResidualTests) -> list[Chart]:

@@ -9,7 +9,7 @@
     const bytes = Uint8Array.from(atob(text), c => c.charCodeAt(0));
     return Array.from(new Float32Array(bytes.buffer), v => Number.isNaN(v) ? null : v);
   };
-  const shown = value => value == null ? "–" : Number(value.toPrecision(5)).toString();
+  const written = value => value == null ? "–" : Number(value.toPrecision(5)).toString();
 
   const marks = chart => ({
     drawClear: u => {
@@ -38,11 +38,11 @@
   });
 
   function options(chart, width) {
-    const series = [{label: chart.x_label, value: (u, v) => shown(v)}];
+    const series = [{label: chart.x_label, value: (u, v) => written(v)}];
     const bands = [];
     for (const curve of chart.curves) {
       const stroke = () => color(curve.color);
-      const one = {label: curve.name, stroke, width: 1.5, points: {show: false}, value: (u, v) => shown(v)};
+      const one = {label: curve.name, stroke, width: 1.5, points: {show: false}, value: (u, v) => written(v)};
       if (curve.kind === "points") Object.assign(one, {width: 0, paths: () => null, points: {show: true, size: 5, stroke, fill: stroke}});
       if (curve.kind === "bars") Object.assign(one, {paths: uPlot.paths.bars({size: [0.4, 6]}), fill: stroke});
       series.push(one);
@@ -52,7 +52,7 @@
         bands.push({series: [series.length - 1, series.length - 2], fill: () => color(curve.color) + "30"});
       }
     }
-    const axis = {stroke: () => color("muted"), grid: {stroke: () => color("grid"), width: 1}, ticks: {show: false}, values: (u, marks) => marks.map(v => v == null ? "" : shown(v))};
+    const axis = {stroke: () => color("muted"), grid: {stroke: () => color("grid"), width: 1}, ticks: {show: false}, values: (u, marks) => marks.map(v => v == null ? "" : written(v))};
     const scale = name => chart.log.includes(name) ? {distr: 3} : {};
     const y = scale("y");
     if (chart.lines.length && !y.distr) {
@@ -84,9 +84,14 @@
     for (const other of plots) if (other === plot || (plot.group && other.group === plot.group)) action(other.u);
   };
 
-  for (const chart of charts) {
+  function draw(chart) {
     const figure = document.getElementById(`figure-${chart.name}`);
     const place = figure.querySelector(".live");
+    const fold = figure.closest("details:not([open])");
+    if (fold) {  // drawn when it is opened
+      fold.addEventListener("toggle", () => draw(chart), {once: true});
+      return;
+    }
     place.hidden = false;
     const data = [unpack(chart.x)];
     for (const curve of chart.curves) {
@@ -95,6 +100,7 @@
     }
     const plot = {name: chart.name, group: chart.group, figure, place};
     plot.u = new uPlot(options(chart, place.clientWidth), data, place);
+    const shown = plots.find(other => plot.group && other.group === plot.group);
     plots.push(plot);
     let passing = false;
     plot.u.hooks.setScale = [(u, key) => {
@@ -114,7 +120,10 @@
     });
     for (const button of figure.querySelectorAll("button")) button.addEventListener("click", keys[button.dataset.key]);
     figure.classList.add("ready");
+    if (shown) plot.u.setScale("x", {min: shown.u.scales.x.min, max: shown.u.scales.x.max});
+    else if (chart.view) plot.u.setScale("x", {min: chart.view[0], max: chart.view[1]});
   }
+  charts.forEach(draw);
 
   // The tuning page: the sliders choose among designs that were computed beforehand.
   const tuning = JSON.parse(document.getElementById("tuning-data").textContent);
@@ -160,6 +169,7 @@
     choose();
   }
 
+  addEventListener("beforeprint", () => document.querySelectorAll("details").forEach(one => { one.open = true; }));
   const redraw = () => plots.forEach(plot => plot.u.redraw(false, true));
   matchMedia("(prefers-color-scheme: dark)").addEventListener("change", redraw);
   new ResizeObserver(() => plots.forEach(plot => {

@@ -23,7 +23,7 @@ def page(name: str, charts: Sequence[Chart] | None = None, **content: Any) -> st
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    environment.filters |= {"label": words.label, "number": words.number}
+    environment.filters |= {"label": words.label, "sentence": words.to_sentence}
     style = text("colors.css") + text("report.css")
     if charts is not None:
         style = text("uplot/uPlot.min.css") + style

@@ -1,11 +1,12 @@
-"""Names, units and explanations in the reader's words."""
+"""Numbers, names and messages in the reader's words, the same on the terminal and on pages."""
 
 import math
-from collections.abc import Mapping
+import re
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from datetime import datetime, timezone
 
-from smp_motor_ident.finding import SEVERITIES, Finding
-from smp_motor_ident.result import Estimate, Quantity
+from smp_motor_ident.result import Quantity
 
 EXPLAINED: Mapping[str, tuple[str, str, str]] = {
     "resistance": ("R", "Resistance", "of the armature winding"),
@@ -17,10 +18,11 @@ EXPLAINED: Mapping[str, tuple[str, str, str]] = {
     "coulomb_friction_reverse": ("Tc−", "Coulomb friction, reverse", "turning backwards"),
     "delay": ("τd", "Delay", "from voltage to speed, sensor filters included"),
     "dc_gain": ("k", "DC gain", "steady motor speed per volt beyond the static voltage"),
-    "time_constant": ("τ", "Time constant", "how slowly the speed follows"),
-    "time_constant_product": ("τ²", "Lag product", "of the electrical and mechanical lag"),
+    "time_constant": ("τ", "Time constant", "how slowly the speed follows, all lags together"),
+    "time_constant_product": ("τ₁τ₂", "Lag product", "of the two time constants"),
     "static_voltage": ("v0", "Static voltage", "needed to keep the motor barely turning"),
     "static_voltage_reverse": ("v0−", "Static voltage, reverse", "turning backwards"),
+    "steady_speed": ("ω∞", "Steady speed", "at the one voltage that was recorded"),
     "load_voltage": ("vl", "Load voltage", "offset that a constant load or sensor makes"),
     "averaging_window": ("w", "Averaging window", "over which the sensor averages the speed"),
     "sensor_lag": ("τs", "Sensor lag", "by which the speed's low-pass is late"),
@@ -30,11 +32,7 @@ EXPLAINED: Mapping[str, tuple[str, str, str]] = {
     "source_resistance_ratio": ("ρ", "Source resistance", "of the supply, over the armature's"),
     "brush_drop": ("vb", "Brush drop", "over brushes or transistors, whatever the current"),
     "quadratic_drag": ("c", "Quadratic drag", "voltage that it takes, over back-EMF squared"),
-    "current_limit_voltage": (
-        "vi",
-        "Current limit",
-        "of the driver, times the resistance",
-    ),
+    "current_limit_voltage": ("vi", "Current limit", "of the driver, times the resistance"),
     "fast_decay_ratio": ("τₑf", "Fast-decay ratio", "electrical time constant in PWM periods"),
     "coasting_share": ("s₀", "Coasting share", "of back-EMF in the voltage at steady speed"),
     "current_lag": ("τi", "Current lag", "by which the current's sensor is late on average"),
@@ -49,11 +47,23 @@ MODELS: Mapping[str, str] = {
 }
 
 
+SCALES = {"s": ("ms", 1e3), "s^2": ("ms^2", 1e6), "H": ("mH", 1e3), "N m": ("mN m", 1e3)}
+"""Units that a motor's numbers are small in: what is written instead, and how many of it."""
+
+MOST_DIGITS = 9  # of a number: more are those of a simulation without noise
+
+
 def label(name: str) -> str:
     """Return a wheel, quantity or model in words."""
     if name in EXPLAINED:
         return EXPLAINED[name][1]
     return name.replace("_", " ").strip().capitalize()
+
+
+def put_within(name: str) -> str:
+    """Return a quantity as it is written within a sentence."""
+    text = label(name)
+    return text if text[:2].isupper() else text[0].lower() + text[1:]
 
 
 def model(name: str) -> str:
@@ -94,12 +104,68 @@ def spread(std: float | None) -> str:
     return f"{std:.1e}"
 
 
+def state(quantity: Quantity, with_unit: bool = True) -> str:
+    """Return a number with ± one standard deviation and unit, or the range that is left open.
+
+    Examples
+    --------
+    >>> state(Quantity(0.0381133, 0.0016, unit="s"))
+    '38.1 ± 1.6 ms'
+    >>> state(Quantity(1.39973e-5, 8.6e-9, unit="kg m^2"))
+    '(1.39973 ± 0.00086)·10⁻⁵ kg m²'
+    >>> state(Quantity(None, ci95=(0.0, 0.0525), unit="s", status="unidentifiable"))
+    '0 … 52.5 ms'
+    """
+    shown = scaled(quantity)
+    if shown.value is None:
+        text = interval(quantity)
+    elif not shown.std:
+        text = f"{shown.value:.6g}"
+    else:
+        text = _written(" ± ", (shown.value, shown.std), shown)
+    return _with_unit(text, shown.unit) if with_unit and is_told(quantity) else text
+
+
 def interval(quantity: Quantity) -> str:
-    """Return the 95 % interval of a number."""
-    if quantity.ci95 is None:
+    """Return the 95 % interval of a number, or the range that is left open, in the unit shown.
+
+    Examples
+    --------
+    >>> interval(Quantity(25.5, 0.1, (25.304, 25.696), "rad/s/V"))
+    '25.30 … 25.70'
+    """
+    shown = scaled(quantity)
+    if shown.ci95 is None:
         return "—"
-    low, high = (number(bound, quantity.std) for bound in quantity.ci95)
-    return f"{low} … {high}"
+    if shown.value is None or not shown.std:
+        return " … ".join(map(_rounded, shown.ci95))
+    return _written(" … ", shown.ci95, shown)
+
+
+def _written(between: str, values: Sequence[float], of: Quantity) -> str:
+    """Return numbers with the decimals of a deviation's two digits, and their power of ten."""
+    std, size = of.std or 0.0, max(abs(of.value or 0.0), of.std or 0.0)
+    power = 0 if 1e-3 <= size < 1e6 else math.floor(math.log10(size))
+    places = 1 - math.floor(math.log10(float(f"{std:.1e}"))) + power
+    places = min(places, MOST_DIGITS - 1 - math.floor(math.log10(size)) + power)
+    text = between.join(_fixed(value / 10.0**power, places) for value in values)
+    superscript = str(power).translate(str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹"))
+    return f"({text})·10{superscript}" if power else text
+
+
+def _fixed(value: float, places: int) -> str:
+    """Return a number with so many decimals; a deviation too small for them with an exponent."""
+    rounded = round(value, places)
+    return f"{rounded:.{max(places, 0)}f}" if rounded or not value else f"{value:.1e}"
+
+
+def _rounded(end: float) -> str:
+    """Return the end of a range with three digits."""
+    return "∞" if math.isinf(end) else f"{end:.0f}" if 100 <= abs(end) < 1e6 else f"{end:.3g}"
+
+
+def _with_unit(text: str, unit: str) -> str:
+    return text if unit in ("", "1") else f"{text} {typeset(unit)}"
 
 
 def systematic(quantity: Quantity) -> str:
@@ -110,17 +176,20 @@ def systematic(quantity: Quantity) -> str:
     >>> systematic(Quantity(12.9, 0.02, systematic=(Share("current_scale", 0.03, 0.39),)))
     '± 3 % (current scale)'
     """
+    shown = scaled(quantity)
     signs = {-1: "−", 0: "± ", 1: "+"}
-    return ", ".join(
+    words = [
         signs[one.side]
         + (
             f"{100 * one.share:.2g} %"
             if one.share is not None
-            else f"{spread(one.size)} {quantity.unit}"
+            else _with_unit(spread(one.size), shown.unit)
         )
         + f" ({one.cause.replace('_', ' ')})"
-        for one in quantity.systematic
-    )
+        for one in shown.systematic
+    ]
+    volts = (quantity.valid or {}).get("voltage")
+    return ", ".join([*words, *([f"seen at ±{volts[1]:.3g} V only"] if volts else [])])
 
 
 def typeset(unit: str) -> str:
@@ -129,11 +198,22 @@ def typeset(unit: str) -> str:
 
 
 def scaled(quantity: Quantity) -> Quantity:
-    """Return a time in milliseconds, anything else as it is."""
-    unit, factor = {"s": ("ms", 1e3), "s^2": ("ms²", 1e6)}.get(quantity.unit, (quantity.unit, 1.0))
+    """Return a quantity in the unit that people use for its size, such as a time in ms."""
+    unit, factor = SCALES.get(quantity.unit, (quantity.unit, 1.0))
     value, std = (None if one is None else one * factor for one in (quantity.value, quantity.std))
     ci95 = quantity.ci95 and (quantity.ci95[0] * factor, quantity.ci95[1] * factor)
-    return replace(quantity, value=value, std=std, ci95=ci95, unit=unit)
+    shares = tuple(replace(one, size=one.size * factor) for one in quantity.systematic)
+    return replace(quantity, value=value, std=std, ci95=ci95, unit=unit, systematic=shares)
+
+
+def date(seconds: float) -> str:
+    """Return a time since 1970 as files bear it."""
+    return datetime.fromtimestamp(seconds, timezone.utc).strftime("%Y-%m-%d %H:%M UTC")
+
+
+def is_told(quantity: Quantity) -> bool:
+    """Return whether there is a number or a range to state."""
+    return quantity.value is not None or quantity.ci95 is not None
 
 
 def status(quantity: Quantity) -> str:
@@ -142,6 +222,18 @@ def status(quantity: Quantity) -> str:
     return words[quantity.status]
 
 
-def findings(estimate: Estimate) -> list[Finding]:
-    """Return what was found, the gravest first."""
-    return sorted(estimate.findings, key=lambda f: -SEVERITIES.index(f.severity))
+def to_sentence(text: str) -> str:
+    """Return a message as a sentence, with the names of quantities in words.
+
+    Examples
+    --------
+    >>> to_sentence("the data do not tell time_constant")
+    'The data do not tell time constant.'
+    """
+    text = re.sub(r"\b[a-z]+(_[a-z]+)+\b(?!=)", _name_in_words, text.strip())
+    text = re.sub(r"^[a-z]+(?=[ ,;:])", lambda m: m[0].capitalize(), text)
+    return text if not text or text[-1] in ".!?" else f"{text}."
+
+
+def _name_in_words(found: re.Match[str]) -> str:
+    return put_within(found[0]) if found[0] in EXPLAINED or found[0] in MODELS else found[0]

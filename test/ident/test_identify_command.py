@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import json
+import re
 import subprocess
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from subprocess import PIPE
 
 import numpy as np
 import pytest
+from browser import CHROMIUM, Browser
 from scipy.signal import cont2discrete, lfilter
 
 from smp_motor_control.motor.file import load_motors
@@ -18,6 +21,7 @@ from smp_motor_ident.cli import identification
 from smp_motor_ident.cli.identification import OUTPUTS
 from smp_motor_ident.cli.identify import main
 from smp_motor_ident.finding import Finding
+from smp_motor_ident.report import words
 from smp_motor_ident.result import Estimate, Quantity
 
 GAIN, LAG, STEP = 25.0, 0.06, 0.01
@@ -68,6 +72,69 @@ def test_it_writes_its_three_files_and_recovers_the_motor(recording: Path, tmp_p
     page = (output / "report.html").read_text()
     assert "<svg" in page
     assert "log.csv" in page
+
+
+UNITS = {"ms": 1e-3, "ms²": 1e-6}
+
+
+@pytest.mark.skipif(not CHROMIUM, reason="no Chromium on this machine")
+def test_terminal_json_and_page_state_the_same_numbers(
+    recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    output = tmp_path / "result"
+    assert main([str(recording), *MAP, "--output", str(output)]) == 0
+    terminal = capsys.readouterr().out
+    (motor,) = json.loads((output / "identification.json").read_text())["motors"].values()
+    with Browser(tmp_path / "profile") as browser:
+        browser.open(output / "report.html", 1280)
+        rows: list[list[str]] = browser.value(
+            "[...document.querySelectorAll('.values tbody tr')].map(r => [r.children[0].firstChild"
+            ".textContent.trim(), r.children[1].textContent])"
+        )
+        fit = browser.value("document.querySelector('.fit').textContent")
+    assert fit in " ".join(terminal.split())
+    assert f"{motor['fit_percent']['validation']:.1f} %" in fit
+    page = dict(rows)
+    for name in ("dc_gain", "time_constant"):
+        text = page[words.label(name)]
+        # Label and number stand in one line of the terminal, nothing but space between them.
+        assert re.search(rf"{words.label(name)} +{re.escape(text)} ", terminal)
+        value, std, unit = re.fullmatch(r"([\d.]+) ± ([\d.]+) (\S+)", text).groups()  # type: ignore[union-attr]
+        digit = 10.0 ** -len(value.partition(".")[2])  # of the last decimal
+        for written, kept in ((value, "value"), (std, "std")):
+            stated = motor["combinations"][name][kept] / UNITS.get(unit, 1.0)
+            assert float(written) == pytest.approx(stated, abs=0.501 * digit)
+
+
+def test_the_terminal_shows_the_three_gravest_messages_and_all_on_request(
+    recording: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    findings = [
+        *(Finding(f"note_{k}", "note", f"note {k} of dc_gain") for k in range(2)),
+        *(Finding(f"odd_{k}", "warning", f"warning {k}", {}, f"do {k}") for k in range(3)),
+        Finding("lag_unknown", "unreliable", "the data do not tell dc_gain", {}, "record more"),
+    ]
+    shown = replace(found("note"), findings=tuple(findings))
+    monkeypatch.setattr(identification, "estimate", lambda *_, **__: shown)
+    arguments = [str(recording), *MAP, "--output", str(tmp_path / "r"), "--force"]
+    assert main(arguments) == 1
+    said = capsys.readouterr()
+    assert re.findall(r"^\d\. .*$", said.out, re.MULTILINE) == [
+        "1. Unreliable: The data do not tell DC gain. Record more.",
+        "2. Warning: Warning 0. Do 0.",
+        "3. Warning: Warning 1. Do 1.",
+    ]
+    assert "Unreliable: every number." in said.out  # of which there is one
+    assert re.search(r"DC gain +25.00 ± 0.10 rad/s/V .*unreliable, see 1", said.out)
+    assert "3 more findings: in the report, or with --verbose." in said.out
+    assert said.err.startswith("identify: motor: Unreliable: every number (lag_unknown). Record")
+    assert main([*arguments, "--verbose"]) == 1
+    said = capsys.readouterr()
+    assert len(re.findall(r"^\d\. ", said.out, re.MULTILINE)) == len(findings)
+    assert "6. Note: Note 1 of DC gain." in said.out
 
 
 def test_it_replaces_nothing_without_force(
@@ -202,13 +269,13 @@ def test_an_unreliable_answer_is_written_and_ends_with_one_unless_accepted(
     output = tmp_path / "result"
     assert main([str(recording), *MAP, "--output", str(output), "--quiet", *options]) == code
     said = capsys.readouterr().err
-    assert ("record a slow ramp" in said) == (code == 1)
+    assert ("Record a slow ramp." in said) == (code == 1)
     assert "a dead zone of 1 V" not in said  # which the report and the table above it tell
     (motor,) = json.loads((output / "identification.json").read_text())["motors"].values()
     assert motor["findings"][0]["severity"] == severity
     page = (output / "report.html").read_text()
-    assert "a dead zone of 1 V" in page
-    assert "record a slow ramp" in page
+    assert "A dead zone of 1 V." in page
+    assert "Record a slow ramp." in page
 
 
 def test_a_reader_that_has_gone_does_not_change_the_answer(recording: Path, tmp_path: Path) -> None:

@@ -1,0 +1,104 @@
+"""What a reader is told of a motor first: how far to trust it, in which numbers, and why."""
+
+import re
+import shlex
+from dataclasses import dataclass
+
+from smp_motor_ident.finding import SEVERITIES, Finding
+from smp_motor_ident.report.words import is_told, put_within, to_sentence
+from smp_motor_ident.result import Estimate, Quantity
+
+MOST_MESSAGES = 3
+"""So many are shown of a motor without being asked for; more are not read."""
+
+POOR_FIT = 80.0
+"""Below, a fifth of the motion is unexplained [%]: a loop designed on it meets another motor."""
+
+
+@dataclass(frozen=True)
+class Message:
+    """A finding as it is told, with its number among those of the motor, from 1."""
+
+    number: int
+    severity: str
+    text: str
+    advice: str
+
+
+def select_messages(estimate: Estimate) -> tuple[list[Message], list[Message]]:
+    """Return the messages that are shown of a motor, the gravest first, and all others."""
+    told = [
+        Message(k, finding.severity, to_sentence(finding.message), to_sentence(finding.advice))
+        for k, finding in enumerate(_by_severity(estimate), 1)
+    ]
+    shown = min(sum(one.severity != "note" for one in told), MOST_MESSAGES)
+    return told[:shown], told[shown:]
+
+
+def _by_severity(estimate: Estimate) -> list[Finding]:
+    return sorted(estimate.findings, key=lambda f: -SEVERITIES.index(f.severity))
+
+
+def _told(estimate: Estimate) -> list[str]:
+    """Return the names of all numbers, and ranges that are left open, of a motor."""
+    every = {**estimate.combinations, **estimate.parameters}
+    return [name for name, quantity in every.items() if is_told(quantity)]
+
+
+def find_doubted(estimate: Estimate) -> dict[str, int]:
+    """Return the quantities that may be off by more than is stated, each with its message."""
+    doubted: dict[str, int] = {}
+    for number, finding in enumerate(_by_severity(estimate), 1):
+        if finding.severity in ("unreliable", "refused"):
+            doubted = {**dict.fromkeys(find_affected(finding, estimate), number), **doubted}
+    return doubted
+
+
+def find_affected(finding: Finding, estimate: Estimate) -> list[str]:
+    """Return the quantities that a finding names, or all where it names none."""
+    known = _told(estimate)
+    text = " ".join([finding.message, str(finding.evidence.get("quantity")), *finding.evidence])
+    text = text.replace(" gain", " dc_gain")
+    named = [name for name in known if re.search(rf"\b({name}|{put_within(name)})\b", text)]
+    return named or known
+
+
+def judge(estimate: Estimate) -> tuple[str, str]:
+    """Return how far to trust a motor: ``good``, ``fair`` or ``poor``, and why in a few words."""
+    percent = estimate.fit_percent.validation
+    if estimate.unreliable:
+        doubted = find_doubted(estimate)
+        every = len(doubted) == len(_told(estimate))
+        which = "every number" if every else ", ".join(map(put_within, doubted))
+        return "poor", f"Unreliable: {which}"
+    if percent is not None and percent < POOR_FIT:
+        return "poor", "Poor fit: too little to build a controller on"
+    warnings = sum(f.severity == "warning" for f in estimate.findings)
+    if warnings:
+        return "fair", f"Usable, with {warnings} warning{'s' if warnings > 1 else ''}"
+    return ("fair", "Not tested: no data was held out") if percent is None else ("good", "Reliable")
+
+
+def describe_fit(estimate: Estimate) -> str:
+    """Return how well the simulated speed fits the measured one."""
+    known = (
+        (estimate.fit_percent.validation, "to data that the model was not fitted to"),
+        (estimate.fit_percent.estimation, "to those that it was fitted to"),
+    )
+    parts = [f"{percent:.1f} % {where}" for percent, where in known if percent is not None]
+    return f"Fit of the simulated speed: {', '.join(parts)}." if parts else ""
+
+
+def advise_tuning(estimate: Estimate, folder: str) -> tuple[str, str]:
+    """Return what to say of gains, and the command that designs them from the results' folder."""
+    if estimate.combinations.get("dc_gain", Quantity(None)).value is None:
+        return "No gains: these data do not tell the DC gain.", ""
+    command = f"tune {shlex.quote(folder)} --output gains.yaml"
+    if not estimate.hardware.supply_voltage:
+        command += " --supply VOLTS"
+    if estimate.unreliable:
+        return (
+            "Design gains, slow ones for unreliable numbers, with",
+            f"{command} --accept-unreliable",
+        )
+    return "Design gains with", command

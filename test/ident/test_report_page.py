@@ -1,0 +1,184 @@
+"""The report as its reader meets it: how long it is, in which order, and what is seen at once."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from browser import CHROMIUM, Browser
+from results import estimate
+
+from smp_motor_ident.finding import Finding
+from smp_motor_ident.report.figures import Comparison
+from smp_motor_ident.report.html import Report, render
+from smp_motor_ident.result import Estimate, Quantity, Share
+
+pytestmark = pytest.mark.skipif(not CHROMIUM, reason="no Chromium on this machine")
+
+WHEELS = ("front_left", "front_right", "rear_left", "rear_right")
+LONG = "the voltage has one size, 3 V: " + ", ".join(["a driver that looks like another motor"] * 5)
+
+
+def poor(wheel: str) -> Estimate:
+    """Return a result with all that a card may hold: many messages, doubts, a range, shares."""
+    known = estimate(wheel)
+    told = dict(known.combinations)
+    told["time_constant"] = Quantity(None, ci95=(0.0, 0.0525), unit="s", status="unidentifiable")
+    told["time_constant_product"] = Quantity(6e-4, 3e-5, (5.4e-4, 6.6e-4), "s^2")
+    told["static_voltage"] = Quantity(0.3, 0.04, (0.22, 0.38), "V")
+    told["delay"] = Quantity(0.0083, 0.0012, (0.006, 0.0105), "s")
+    physical = {
+        n: replace(q, systematic=(Share("current_scale", 0.03, 0.03 * (q.value or 0.0)),))
+        for n, q in known.parameters.items()
+    }
+    warnings = [Finding(f"w{k}", "warning", f"{k}: {LONG}", advice=LONG) for k in range(4)]
+    notes = [Finding(f"n{k}", "note", f"{k}: {LONG}") for k in range(3)]
+    grave = Finding("lag_unknown", "unreliable", "the data do not tell time_constant", advice=LONG)
+    return replace(
+        known, combinations=told, parameters=physical, findings=(*notes, *warnings, grave)
+    )
+
+
+def drive() -> list[Comparison]:
+    """Return 40 s of a speed that follows a square of the voltage, the last third held out."""
+    rng, parts = np.random.default_rng(7), []
+    for role, seconds in (("estimation", 27.0), ("validation", 13.0)):
+        time = np.arange(0.0, seconds, 0.005)
+        voltage = 8 * np.sign(np.sin(2 * np.pi * 0.37 * time))
+        speed = 25 * voltage
+        noisy = speed + rng.normal(0, 2, time.size)
+        parts.append(Comparison(role, "bag", time, voltage, noisy, speed))  # type: ignore[arg-type]
+    return parts
+
+
+@pytest.fixture(scope="module")
+def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
+    with Browser(tmp_path_factory.mktemp("profile")) as opened:
+        yield opened
+
+
+@pytest.fixture(scope="module")
+def file(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("page") / "report.html"
+    report = Report(
+        {wheel: poor(wheel) for wheel in WHEELS},
+        {wheel: drive() for wheel in WHEELS},
+        provenance={"Recordings": "monday", "Command": "identify monday"},
+        folder="my results",
+    )
+    path.write_text(render(report))
+    return path
+
+
+def tops(browser: Browser, *selectors: str) -> list[float]:
+    """Return where the first element of each selector begins, from the top of the page."""
+    at = "document.querySelector({!r}).getBoundingClientRect().top + scrollY"
+    return [browser.value(at.format(selector)) for selector in selectors]
+
+
+@pytest.mark.parametrize(("width", "highest"), [(1280, 5000), (390, 12_000)])
+@pytest.mark.parametrize("dark", [False, True])
+def test_four_wheels_full_of_warnings_are_short_and_never_scroll_sideways(
+    browser: Browser, file: Path, width: int, highest: int, dark: bool
+) -> None:
+    browser.open(file, width, dark=dark)
+    # A phone of 390 px shows a third of what 1280 px show: its limit is what that makes of 5,000.
+    assert browser.value("document.documentElement.scrollHeight") <= highest
+    for _ in range(2):  # as it opens, and with everything unfolded
+        assert browser.value("document.documentElement.scrollWidth") <= width
+        assert browser.value(
+            "[...document.querySelectorAll('main table')].every(t => t.closest('.scroll') ||"
+            " t.scrollWidth <= t.parentElement.clientWidth + 1)"
+        )
+        browser.value("document.querySelectorAll('details').forEach(d => { d.open = true; })")
+    assert browser.complaints == []
+
+
+def test_a_motor_is_told_in_the_order_of_its_readers_questions(
+    browser: Browser, file: Path
+) -> None:
+    browser.open(file, 390)
+    order = tops(
+        browser, "h1", "#side-by-side", "#front_left h2", "#front_left .values",
+        "#front_left .chart", "#front_left .gains", "#front_left .findings",
+        "#front_left details", "#front_right", "#reading",
+    )  # fmt: skip
+    assert order == sorted(order)
+    every = "[...document.querySelectorAll('#front_left .findings li')]"
+    seen = f"{every}.filter(e => !e.closest('details'))"
+    tags = browser.value(f"{seen}.map(e => e.querySelector('.tag').textContent)")
+    assert tags == ["unreliable 1", "warning 2", "warning 3"]
+    assert browser.value("document.querySelectorAll('details[open]').length") == 0
+    folded = "document.querySelectorAll('#front_left details .findings li').length"
+    assert browser.value(folded) == 5
+
+
+def row(browser: Browser, name: str) -> list[str]:
+    """Return the cells of a quantity in the first card."""
+    cells: list[str] = browser.value(
+        "[...document.querySelectorAll('#front_left .values tr')].map(r => [...r.children]"
+        f".map(c => c.textContent)).find(r => r[0].startsWith({name!r}))"
+    )
+    return cells
+
+
+def test_the_card_says_which_number_is_unreliable_and_names_what_no_recording_shows(
+    browser: Browser, file: Path
+) -> None:
+    browser.open(file, 1280)
+    verdict = browser.value("document.querySelector('#front_left .verdict').textContent")
+    assert verdict == "Unreliable: time constant"
+    # A number that is not known has its range; one that is, the digits that its ± allows.
+    assert row(browser, "Time constant") == [
+        "Time constant τ", "0 … 52.5 ms", "not identifiableunreliable, see 1",
+    ]  # fmt: skip
+    assert row(browser, "DC gain") == ["DC gain k", "25.50 ± 0.10 rad/s/V", ""]
+    assert row(browser, "Lag product")[0] == "Lag product τ₁τ₂"
+    assert row(browser, "Resistance")[1:] == ["12.92 ± 0.13 Ω", "± 3 % (current scale)"]
+    fit = browser.value("document.querySelector('#front_left .fit').textContent")
+    assert "96.8 % to data that the model was not fitted to" in fit
+    gains = browser.value("document.querySelector('#front_left .gains').textContent")
+    assert "tune 'my results' --output gains.yaml --accept-unreliable" in gains
+
+
+def test_intervals_side_by_side_are_seen_on_an_axis(browser: Browser, file: Path) -> None:
+    browser.open(file, 1280)
+    compared: list[dict[str, Any]] = browser.value(
+        "[...document.querySelectorAll('.compared')].map(f => ({name: f.querySelector('h3')"
+        ".textContent, ticks: [...f.querySelectorAll('.axis text')].map(t => t.textContent),"
+        " wide: [...f.querySelectorAll('line:not(.grid)')].map(l => l.getBoundingClientRect()"
+        ".width)}))"
+    )
+    named = {one["name"]: one for one in compared}
+    # Of a quantity that no wheel has, only a range, nothing is compared.
+    assert "Time constant" not in named
+    for one in compared:
+        assert len(one["ticks"]) >= 2
+        assert len(one["wide"]) == 2 * len(WHEELS)  # random, and with systematic uncertainty
+        assert min(one["wide"]) > 10  # px
+    random, total = named["Resistance"]["wide"][1], named["Resistance"]["wide"][0]
+    # 2 % of scatter at 95 %, 3 % of one deviation of scale: sqrt(2^2 + (1.96 * 3)^2) of 2.
+    assert total / random == pytest.approx(3.1, rel=0.02)
+
+
+def test_the_picture_begins_where_single_answers_are_seen_and_shows_all_on_request(
+    browser: Browser, tmp_path: Path
+) -> None:
+    known = estimate()
+    path = tmp_path / "report.html"
+    path.write_text(render(Report({known.wheel: known}, {known.wheel: drive()})))
+    browser.open(path, 1280)
+    shown = "document.querySelector('.live').dataset.shown"
+    begin, end = map(float, browser.value(shown).split())
+    # Eighty lags of 40 ms, out of what was held out.
+    assert end - begin == pytest.approx(3.2, abs=0.1)
+    assert begin > 26.9 and end <= 40.0
+    browser.value("document.querySelector('button[data-key=\"0\"]').click()")
+    done = "new Promise(done => requestAnimationFrame(() => requestAnimationFrame(done)))"
+    browser.ask("Runtime.evaluate", awaitPromise=True, expression=done)
+    begin, end = map(float, browser.value(shown).split())
+    assert (begin, end) == pytest.approx((0.0, 40.0), abs=0.1)
