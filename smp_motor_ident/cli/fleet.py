@@ -23,8 +23,9 @@ from smp_motor_ident import bag
 from smp_motor_ident.cli.workers import end_with_parent
 from smp_motor_ident.errors import BagError, ParameterError, SmpError
 from smp_motor_ident.estimate import estimate
-from smp_motor_ident.report import fleet
+from smp_motor_ident.report import fleet, words
 from smp_motor_ident.report.document import check_free, write_together
+from smp_motor_ident.result import plain
 
 TRIES = 2  # how often a recording is begun that takes its worker with it
 
@@ -52,9 +53,9 @@ def work(
     for path, found in _results(left, settings, arguments.scheduler):
         results[path] = found
         if not any(row.lost for row in found):
-            write_together({files[path]: msgspec.json.encode(found)}, force=True)
+            write_together({files[path]: msgspec.json.encode(plain(found))}, force=True)
         if not arguments.quiet:
-            print(f"{path}: {', '.join(row.wheel or row.failure for row in found)}", flush=True)
+            print("\n".join(map(fleet.describe, found)), flush=True)
     rows = [row for path in files for row in results[path]]
     marks = [*fleet.drifts(rows), *fleet.outliers(rows)]
     name, content = fleet.table(rows)
@@ -65,7 +66,8 @@ def work(
     write_together(pages, arguments.force)
     if not arguments.quiet:
         for mark in marks:
-            print(f"{mark.kind}: {mark.robot} {mark.wheel} {mark.quantity}: {mark.text}")
+            what = words.put_within(mark.quantity)
+            print(f"{mark.kind}: {fleet.where(mark)}: {what} {mark.text}")
         print(f"written: {', '.join(map(str, pages))}")
     return int(any(row.failure or row.unreliable for row in rows))
 
@@ -77,7 +79,7 @@ def _key(path: Path, options: str) -> str:
     parts = sorted(path.rglob("*")) if path.is_dir() else [path]
     seen = [(str(p), p.stat().st_size, p.stat().st_mtime_ns) for p in parts if p.is_file()]
     version = metadata.version("smp_motor_control")
-    text = json.dumps(["rows", str(path.resolve()), seen, options, version])
+    text = json.dumps(["rows with intervals", str(path.resolve()), seen, options, version])
     return hashlib.sha256(text.encode()).hexdigest()[:32]
 
 
@@ -87,18 +89,18 @@ def identify_one(path: str, settings: tuple[Any, ...]) -> list[fleet.Row]:
     rows = []
     try:
         for wheel, records in bag.read_experiments([path], mapping).items():
+            dates = [one.recorded for one in records if one.recorded is not None]
+            about: dict[str, Any] = dict(wheel=wheel, date=min(dates, default=None))
             try:
                 found = estimate(records, model, fixed=fixed)
             except SmpError as error:
-                rows.append(_row(path, wheel=wheel, failure=str(error)))
+                rows.append(_row(path, **about, failure=str(error)))
                 continue
             held = {**found.combinations, **found.parameters}
-            known = {
-                n: held[n] for n in held if n in fleet.QUANTITIES and held[n].value is not None
-            }
-            values = {n: (float(q.value or 0.0), float(q.std or 0.0)) for n, q in known.items()}
+            told = ((name, held.get(name)) for name in fleet.QUANTITIES)
+            values = {name: q for name, q in told if q is not None and q.value is not None}
             verdict = dict(fit_percent=found.fit_percent.validation, unreliable=found.unreliable)
-            rows.append(_row(path, wheel=wheel, values=values, **verdict))
+            rows.append(_row(path, **about, values=values, **verdict))
     except SmpError as error:
         return [_row(path, failure=str(error))]
     except Exception as error:  # whatever is wrong with one recording, the others go on
@@ -109,7 +111,7 @@ def identify_one(path: str, settings: tuple[Any, ...]) -> list[fleet.Row]:
 def _row(path: str, **what: Any) -> fleet.Row:
     """Return a row of a recording; the robot is the folder that it lies in."""
     where = Path(path).resolve()
-    about = {"wheel": "", "values": {}, "date": where.stat().st_mtime, **what}
+    about = {"wheel": "", "values": {}, "date": None, **what}
     return fleet.Row(robot=where.parent.name, source=where.name, **about)
 
 

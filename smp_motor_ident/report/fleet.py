@@ -9,8 +9,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from smp_motor_ident.report import templates
+from smp_motor_control.arrays import Array
+from smp_motor_ident.report import templates, words
 from smp_motor_ident.report.limits import FLEET_DRIFT, FLEET_OUTLIER, FLEET_SIZE
+from smp_motor_ident.result import UNITS, Quantity
 
 QUANTITIES = ("dc_gain", "time_constant", "static_voltage", "resistance", "motor_constant")
 """What is compared, where the recordings tell it."""
@@ -26,8 +28,8 @@ class Row:
     robot: str
     wheel: str
     source: str
-    date: float  # when it was recorded [s since 1970]
-    values: Mapping[str, tuple[float, float]]  # value and standard deviation by name
+    date: float | None  # when it was recorded [s since 1970], by its own stamps
+    values: Mapping[str, Quantity]  # by name, what is compared
     fit_percent: float | None = None  # of the speed in held-out data; None where there is none
     unreliable: bool = False  # whether the identification calls itself so
     failure: str = ""  # why there are no values
@@ -45,27 +47,44 @@ class Mark:
     text: str  # in words, with the numbers
 
 
+def where(row: Row | Mark) -> str:
+    """Return whose motor it is."""
+    return f"{row.robot}, {words.put_within(row.wheel)}" if row.wheel else row.robot
+
+
 def drifts(rows: Sequence[Row]) -> list[Mark]:
     """Return which motors change with time, by a straight line through their values.
 
     The deviation of the slope is the larger of that from the stated deviations and that from the
-    scatter around the line.
+    scatter around the line.  What no recording shows is the same in all, and left out.
     """
     marks = []
-    for (robot, wheel, name), held in _grouped(rows, lambda r: r.robot).items():
-        day = np.array([r.date / DAY for r in held])
-        value, std = np.array([r.values[name] for r in held]).T
+    dated = [row for row in rows if row.date is not None]
+    for (robot, wheel, name), held in _grouped(dated, lambda r: r.robot).items():
+        day = np.array([(r.date or 0.0) / DAY for r in held])
+        value, std = _numbers(held, name)
         if len(held) < 3 or np.ptp(day) == 0 or not np.all(std > 0):
             continue
         middle = np.average(day, weights=std**-2.0)  # there the line is at the mean
         (slope, mean), stated = np.polyfit(day - middle, value, 1, w=1 / std, cov="unscaled")
         rest = (value - mean - slope * (day - middle)) / std
         scatter = max(1.0, float(np.sum(rest**2)) / (len(held) - 2))
-        if abs(slope) > FLEET_DRIFT.value * math.sqrt(scatter * stated[0, 0]):
-            share = 100 * slope * 30 / mean
-            text = f"{share:+.2g} % in 30 days, over {len(held)} recordings"
+        deviation = math.sqrt(scatter * stated[0, 0])
+        if abs(slope) > FLEET_DRIFT.value * deviation:
+            shown = Quantity(3000 * slope / mean, abs(3000 * deviation / mean), unit="%")
+            text = (
+                f"changes by {words.state(shown)} in 30 days, {abs(slope) / deviation:.1f} "
+                f"standard deviations over {len(held)} recordings in {np.ptp(day):.3g} days"
+            )
             marks.append(Mark("drift", robot, wheel, name, text))
     return marks
+
+
+def _numbers(rows: Sequence[Row], name: str) -> tuple[Array, Array]:
+    """Return the values of a quantity and their standard deviations."""
+    pairs = [(r.values[name].value, r.values[name].std or 0.0) for r in rows]
+    value, std = np.array(pairs, dtype=np.float64).T
+    return value, std
 
 
 def outliers(rows: Sequence[Row]) -> list[Mark]:
@@ -76,16 +95,19 @@ def outliers(rows: Sequence[Row]) -> list[Mark]:
     """
     marks = []
     for (_, wheel, name), held in _grouped(rows, lambda r: "").items():
-        last = list({r.robot: r for r in sorted(held, key=lambda r: r.date)}.values())
+        last = list({r.robot: r for r in sorted(held, key=lambda r: r.date or 0.0)}.values())
         if len(last) < FLEET_SIZE.value:
             continue
-        value, std = np.array([r.values[name] for r in last]).T
+        value, std = _numbers(last, name)
         middle = float(np.median(value))
         spread = np.hypot(1.4826 * np.median(np.abs(value - middle)), std)
         for row, one, wide in zip(last, value, spread, strict=True):
             if wide > 0 and abs(one - middle) > FLEET_OUTLIER.value * wide:
-                share = 100 * (one / middle - 1)
-                text = f"{share:+.2g} % from the median of {len(last)} robots"
+                shown = words.state(row.values[name])
+                text = (
+                    f"is {shown}, {100 * (one / middle - 1):+.2g} % from the median of "
+                    f"{len(last)} robots, {abs(one - middle) / wide:.1f} of their scatters"
+                )
                 marks.append(Mark("outlier", row.robot, wheel, name, text))
     return marks
 
@@ -109,9 +131,11 @@ def columns(rows: Sequence[Row]) -> dict[str, list[object]]:
 
     out = plain("robot", "wheel", "date", "source")
     for name in QUANTITIES:
-        pairs = [r.values.get(name) for r in rows]
-        out[name] = [p[0] if p else None for p in pairs]
-        out[f"{name}_std"] = [p[1] if p else None for p in pairs]
+        held = [r.values.get(name, Quantity(None)) for r in rows]
+        out[name] = [q.value for q in held]
+        out[f"{name}_std"] = [q.std for q in held]
+        out[f"{name}_low"] = [q.ci95 and q.ci95[0] for q in held]
+        out[f"{name}_high"] = [q.ci95 and q.ci95[1] for q in held]
     return out | plain("fit_percent", "unreliable", "failure")
 
 
@@ -132,14 +156,36 @@ def table(rows: Sequence[Row]) -> tuple[str, bytes]:
     return "fleet.parquet", sink.getvalue().to_pybytes()
 
 
+def describe(row: Row) -> str:
+    """Return what came out for one motor in one recording, in a line."""
+    if row.failure:
+        return row.failure
+    numbers = (f"{words.put_within(n)} {words.state(q)}" for n, q in row.values.items())
+    fit = [] if row.fit_percent is None else [f"fit {row.fit_percent:.1f} %"]
+    text = ", ".join([*numbers, *fit, *(["unreliable"] if row.unreliable else [])])
+    return f"{row.robot}/{row.source}: {row.wheel}: {text}"
+
+
 def page(rows: Sequence[Row], marks: Sequence[Mark]) -> str:
     """Return the table as a page that stands alone."""
-    robots = len({r.robot for r in rows})
+    known = [name for name in QUANTITIES if any(name in row.values for row in rows)]
+    units = {name: words.scaled(Quantity(None, unit=UNITS[name])).unit for name in known}
+    dates = sorted(row.date for row in rows if row.date is not None)
+
+    def count(which: Callable[[Row], bool]) -> int:
+        return len({(r.robot, r.source) for r in rows if which(r)})
+
     return templates.page(
         "fleet.html.jinja",
-        rows=rows,
+        rows=sorted(rows, key=lambda r: (r.robot, r.wheel, r.date or 0.0)),
         marks=marks,
-        quantities=QUANTITIES,
-        robots=robots,
-        day=lambda date: str(np.datetime64(round(date), "s")).replace("T", " "),
+        quantities={name: f"{words.label(name)} [{words.typeset(units[name])}]" for name in known},
+        robots=len({r.robot for r in rows}),
+        motors=len({(r.robot, r.wheel) for r in rows if r.wheel}),
+        recordings=count(lambda r: True),
+        span=[words.date(one) for one in dict.fromkeys((*dates[:1], *dates[-1:]))],
+        undated=count(lambda r: r.date is None and not r.failure),
+        failed=count(lambda r: bool(r.failure)),
+        words=words,
+        where=where,
     )

@@ -4,16 +4,25 @@ from __future__ import annotations
 
 import csv
 import os
+import re
 import signal
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from browser import CHROMIUM, Browser
 
 from smp_motor_ident.cli import fleet as command
 from smp_motor_ident.cli.identify import main
 from smp_motor_ident.report.fleet import DAY, Row, drifts, outliers, page
+from smp_motor_ident.result import Quantity
+
+
+def gain(value: float, std: float = 0.05) -> Quantity:
+    """A gain as an estimate states it."""
+    return Quantity(value, std, (value - 2 * std, value + 2 * std), "rad/s/V")
 
 
 def rows(slope: float, seed: int = 0, robot: str = "one", level: float = 25.0) -> list[Row]:
@@ -21,7 +30,7 @@ def rows(slope: float, seed: int = 0, robot: str = "one", level: float = 25.0) -
     rng = np.random.default_rng(seed)
     return [
         Row(robot, "front_left", f"bag{k}", k * DAY,
-            {"dc_gain": (level * (1 + slope * k) + float(rng.normal(0, 0.05)), 0.05)}, 97.0)
+            {"dc_gain": gain(level * (1 + slope * k) + float(rng.normal(0, 0.05)))}, 97.0)
         for k in range(10)
     ]  # fmt: skip
 
@@ -31,6 +40,19 @@ def test_a_motor_that_drifts_is_told_from_those_that_do_not() -> None:
     steady = [row for k in range(100) for row in rows(0.0, k, f"robot{k}")]
     (mark,) = drifts([*steady, *rows(-0.001, 7, "worn")])
     assert (mark.robot, mark.quantity) == ("worn", "dc_gain")
+    # 0.1 % a day is 3 % in 30 days, known to 30 * 0.2 % / sqrt(82.5): the days' sum of squares.
+    change, deviation = re.match(
+        r"changes by (-[\d.]+) ± ([\d.]+) % in 30 days", mark.text
+    ).groups()  # type: ignore[union-attr]
+    assert float(deviation) == pytest.approx(0.66, abs=0.01)
+    assert float(change) == pytest.approx(-3.0, abs=3 * 0.66)
+    assert "4.6 standard deviations over 10 recordings in 9 days" in mark.text
+
+
+def test_recordings_without_a_date_are_not_compared_over_time() -> None:
+    undated = [replace(row, date=None) for row in rows(-0.01, 7)]
+    assert drifts(undated) == []
+    assert "10 without a date" in page(undated, [])
 
 
 def test_a_motor_unlike_the_others_stands_out_and_a_few_robots_are_not_compared() -> None:
@@ -53,7 +75,7 @@ def fake(path: str, settings: tuple[Any, ...]) -> list[Row]:
     if text == "deadly" and not killed.exists():
         killed.touch()
         os.kill(os.getpid(), signal.SIGKILL)
-    return [command._row(path, wheel="left", values={"dc_gain": (25.0, 0.1)}, fit_percent=97.0)]
+    return [command._row(path, wheel="left", values={"dc_gain": gain(25.0)}, fit_percent=97.0)]
 
 
 def test_a_broken_bag_fails_alone_a_killed_worker_loses_nothing_and_no_work_is_done_twice(
@@ -92,21 +114,81 @@ def test_a_cluster_needs_dask_and_says_so(
         assert "pip install distributed" in capsys.readouterr().err
 
 
-def test_signals_are_mapped_alike_for_every_recording(tmp_path: Path) -> None:
+def write_drive(path: Path, begun: float) -> Path:
+    """Write steps of a motor of 25 rad/s/V and 60 ms, with stamps from ``begun`` on [s]."""
     rng = np.random.default_rng(1)
-    for name in ("one", "two"):
-        (tmp_path / name).mkdir()
-        volts = np.repeat(rng.uniform(-6, 6, 60), 20)
-        speed = np.zeros(volts.size)
-        for k in range(1, speed.size):  # 25 rad/s/V, 60 ms, exact over a step of 10 ms
-            speed[k] = speed[k - 1] + 0.1535 * (25.0 * volts[k - 1] - speed[k - 1])
-        speed += rng.normal(0.0, 0.5, speed.size)
-        rows = np.column_stack((0.01 * np.arange(volts.size), volts, speed))
-        np.savetxt(tmp_path / name / "a.csv", rows, delimiter=",", header="t,u,w", comments="")
-    bags = [str(tmp_path / name / "a.csv") for name in ("one", "two")]
-    mapped = ["--map", "time=t", "voltage=u", "velocity=w"]
-    assert main([*bags, "--fleet", *mapped, "--output", str(tmp_path / "out"), "--quiet"]) == 0
+    volts = np.repeat(rng.uniform(-6, 6, 60), 20)
+    speed = np.zeros(volts.size)
+    for k in range(1, speed.size):  # exact over a step of 10 ms
+        speed[k] = speed[k - 1] + 0.1535 * (25.0 * volts[k - 1] - speed[k - 1])
+    speed += rng.normal(0.0, 0.5, speed.size)
+    rows = np.column_stack((begun + 0.01 * np.arange(volts.size), volts, speed))
+    path.parent.mkdir(exist_ok=True)
+    np.savetxt(path, rows, delimiter=",", header="t,u,w", comments="", fmt="%.15g")
+    return path
+
+
+MAPPED = ["--map", "time=t", "voltage=u", "velocity=w"]
+MONDAY = 1_788_767_600.0  # 2026-09-07 07:53:20 UTC
+
+
+def test_signals_are_mapped_alike_for_every_recording(tmp_path: Path) -> None:
+    bags = [str(write_drive(tmp_path / name / "a.csv", 0.0)) for name in ("one", "two")]
+    assert main([*bags, "--fleet", *MAPPED, "--output", str(tmp_path / "out"), "--quiet"]) == 0
     table = list(csv.DictReader((tmp_path / "out" / "fleet.csv").open()))
     assert [r["robot"] for r in table] == ["one", "two"]
     # A hundredth: 1200 samples at 0.3 % of noise tell the gain a hundred times better.
     assert [float(r["dc_gain"]) for r in table] == pytest.approx([25.0, 25.0], rel=0.01)
+    assert all(float(r["dc_gain_low"]) < float(r["dc_gain"]) < float(r["dc_gain_high"])
+               for r in table)  # fmt: skip
+    assert [r["date"] for r in table] == ["", ""]  # stamps from 0 are no date
+
+
+def test_a_recording_has_its_own_time_and_its_numbers_are_printed_with_units(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    bags = [
+        write_drive(tmp_path / robot / f"day{day}.csv", MONDAY + DAY * day)
+        for robot in ("one", "two")
+        for day in (0, 3)
+    ]
+    for bag in bags:  # as a copy has it
+        os.utime(bag, (0.0, 0.0))
+    out = tmp_path / "out"
+    assert main([*map(str, bags), "--fleet", *MAPPED, "--output", str(out)]) == 0
+    table = list(csv.DictReader((out / "fleet.csv").open()))
+    assert [float(r["date"]) for r in table] == [MONDAY, MONDAY + 3 * DAY] * 2
+    lines = capsys.readouterr().out.splitlines()
+    for where in ("one/day0.csv", "one/day3.csv", "two/day0.csv", "two/day3.csv"):
+        (line,) = [one for one in lines if one.startswith(where)]
+        number = r"[\d.]+ ± [\d.]+"
+        assert re.match(
+            rf"{where}: motor: DC gain {number} rad/s/V, time constant {number} ms, "
+            rf"static voltage {number} V, fit [\d.]+ %$", line
+        )  # fmt: skip
+    shown = (out / "fleet.html").read_text()
+    assert "Fleet of 2 robots" in shown
+    assert (
+        "2 motors in 4 recordings, recorded 2026-09-07 07:53 UTC to 2026-09-10 07:53 UTC<" in shown
+    )
+
+
+@pytest.mark.skipif(not CHROMIUM, reason="no Chromium on this machine")
+def test_the_table_is_read_whole_on_a_screen_and_on_a_phone(tmp_path: Path) -> None:
+    units = {"dc_gain": "rad/s/V", "time_constant": "s", "static_voltage": "V", "resistance": "ohm"}
+    numbers = {
+        name: Quantity(25.54832, 0.00079, (25.54678, 25.54986), unit)
+        for name, unit in {**units, "motor_constant": "N m/A"}.items()
+    }
+    row = Row("robot_of_the_workshop", "front_left", "2026-09-07_excitation", MONDAY, numbers, 98.4)
+    file = tmp_path / "fleet.html"
+    file.write_text(page([row, replace(row, wheel="rear_left", failure="it stood still")], []))
+    cells = "[...document.querySelectorAll('td')].map(c => c.getBoundingClientRect())"
+    with Browser(tmp_path / "profile") as browser:
+        for width in (1280, 390):
+            browser.open(file, width)
+            assert browser.value("document.documentElement.scrollWidth") <= width
+            assert browser.value(f"Math.max(...{cells}.map(c => c.right))") <= width
+            text = browser.value("document.querySelector('tbody tr').textContent")
+            assert "25.54832 ± 0.00079 25.54678 … 25.54986" in text
+            assert browser.complaints == []
