@@ -15,6 +15,7 @@ from smp_motor_ident.report import summary, words
 from smp_motor_ident.result import Estimate
 
 MOST_FIELDS = 12  # so many fields of a topic are printed
+WIDE = 110  # columns of a terminal that has room for 95 % intervals
 _COLOR = {"good": "green", "fair": "yellow", "poor": "red"}
 
 
@@ -38,7 +39,7 @@ def print_estimate(out: Console, estimate: Estimate, verbose: bool = False) -> N
     title = f"{words.label(estimate.wheel)}: {words.model(estimate.model)}"
     out.print(title, style="bold", soft_wrap=True)
     out.print(Text(f"{verdict}.", style=_COLOR[grade]), summary.describe_fit(estimate))
-    out.print(_values(estimate))
+    out.print(_values(estimate, intervals=out.width >= WIDE))
     shown, other = summary.select_messages(estimate)
     for one in (*shown, *other) if verbose else shown:
         text = f"{one.number}. {one.severity.capitalize()}: {one.text} {one.advice}".rstrip()
@@ -48,14 +49,14 @@ def print_estimate(out: Console, estimate: Estimate, verbose: bool = False) -> N
         out.print(f"{more}: in the report, or with --verbose.")
 
 
-def _values(estimate: Estimate) -> Table:
+def _values(estimate: Estimate, intervals: bool) -> Table:
     """Return the numbers and ranges that are known of a motor."""
     held = {**estimate.combinations, **estimate.parameters}
     doubted = summary.find_doubted(estimate)
-    made = table("", "quantity", "value", "95 % interval", "systematic")
+    made = table("", "quantity", "value", *(["95 % interval"] if intervals else []), "systematic")
     for column in made.columns:
         column.justify = "left"
-    made.columns[3].no_wrap = False
+    made.columns[-1].no_wrap = False
     for name, quantity in held.items():
         if words.is_told(quantity):
             remark = [words.systematic(quantity)]
@@ -63,9 +64,10 @@ def _values(estimate: Estimate) -> Table:
                 remark.append(words.status(quantity))
             if name in doubted:
                 remark.append(f"unreliable, see {doubted[name]}")
-            interval = "" if quantity.value is None else words.interval(quantity)
-            text = ", ".join(filter(None, remark))
-            made.add_row(words.label(name), words.state(quantity), interval, text)
+            cells = [words.label(name), words.state(quantity)]
+            if intervals:
+                cells.append("" if quantity.value is None else words.interval(quantity))
+            made.add_row(*cells, ", ".join(filter(None, remark)))
     hidden = [words.put_within(n) for n, q in held.items() if not words.is_told(q)]
     if hidden:
         made.caption = f"not identifiable: {', '.join(hidden)}"

@@ -21,6 +21,7 @@ class Curve:
     # low, high: shape (n,): band around the line
     low: Array | None = None
     high: Array | None = None
+    width: float = 1.5  # of a line [px]
 
 
 @dataclass(frozen=True, eq=False)

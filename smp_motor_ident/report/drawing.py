@@ -109,7 +109,9 @@ class _Plane:
         keep = thin(curve.y, POINTS)
         x, y = self.x(self.chart.x[keep]), self.y(curve.y[keep])
         if curve.kind == "line":
-            parts.append(_path(_polyline(x, y), curve.color, 'stroke-width="1.4"'))
+            behind = ' stroke-opacity=".5"' if curve.width > 2 else ""
+            look = f'stroke-width="{curve.width:g}"{behind}'
+            parts.append(_path(_polyline(x, y), curve.color, look))
             return parts
         ok = np.isfinite(y)
         if curve.kind == "bars":

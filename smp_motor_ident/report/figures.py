@@ -59,7 +59,7 @@ def fit_charts(wheel: str, parts: Sequence[Comparison], lag: float = 0.0) -> lis
         )  # fmt: skip
 
     speeds = (
-        Curve("measured", measured[keep], "measured"),
+        Curve("measured", measured[keep], "measured", width=3.5),  # seen behind the simulated one
         Curve("simulated", simulated[keep], "simulated"),
     )
     residual = Curve("measured − simulated", (measured - simulated)[keep], "ink")

@@ -101,8 +101,8 @@ def _gains(estimate: Estimate, report: Report) -> tuple[str, str]:
     found = tuning.choices[tuning.chosen].design if tuning.choices else None
     if found is None:
         return f"No gains: {tuning.reason}", ""
-    p, i, d = (words.number(x) for x in (found.gains.p, found.gains.i, found.gains.d))
-    return f"Gains, in volts per wheel rad/s: p {p}, i {i} per s, d {d} s; as a file under", ""
+    gains = f"p {found.gains.p:.4g}, i {found.gains.i:.4g}, d {found.gains.d:.4g}"
+    return f"Gains, in volts per wheel rad/s: {gains}; as a file under", ""
 
 
 def _row(name: str, quantity: Quantity, doubt: int | None) -> dict[str, Any]:

@@ -41,8 +41,8 @@
     const series = [{label: chart.x_label, value: (u, v) => written(v)}];
     const bands = [];
     for (const curve of chart.curves) {
-      const stroke = () => color(curve.color);
-      const one = {label: curve.name, stroke, width: 1.5, points: {show: false}, value: (u, v) => written(v)};
+      const stroke = () => color(curve.color) + (curve.width > 2 ? "88" : "");  // a wide one lies behind another
+      const one = {label: curve.name, stroke, width: curve.width, points: {show: false}, value: (u, v) => written(v)};
       if (curve.kind === "points") Object.assign(one, {width: 0, paths: () => null, points: {show: true, size: 5, stroke, fill: stroke}});
       if (curve.kind === "bars") Object.assign(one, {paths: uPlot.paths.bars({size: [0.4, 6]}), fill: stroke});
       series.push(one);
