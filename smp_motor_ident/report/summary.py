@@ -57,8 +57,8 @@ def find_doubted(estimate: Estimate) -> dict[str, int]:
 def find_affected(finding: Finding, estimate: Estimate) -> list[str]:
     """Return the quantities that a finding names, or all where it names none."""
     known = _told(estimate)
-    text = " ".join([finding.message, str(finding.evidence.get("quantity")), *finding.evidence])
-    text = text.replace(" gain", " dc_gain")
+    message = re.sub(r"\bgain\b", "dc_gain", finding.message)
+    text = " ".join([message, str(finding.evidence.get("quantity")), *finding.evidence])
     named = [name for name in known if re.search(rf"\b({name}|{put_within(name)})\b", text)]
     return named or known
 

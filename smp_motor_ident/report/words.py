@@ -231,7 +231,7 @@ def to_sentence(text: str) -> str:
     'The data do not tell time constant.'
     """
     text = re.sub(r"\b[a-z]+(_[a-z]+)+\b(?!=)", _name_in_words, text.strip())
-    text = re.sub(r"^[a-z]+(?=[ ,;:])", lambda m: m[0].capitalize(), text)
+    text = re.sub(r"^[a-z]+(?=[ ,;])", lambda m: m[0].capitalize(), text)
     return text if not text or text[-1] in ".!?" else f"{text}."
 
 

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import math
 import re
+from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
@@ -14,15 +16,15 @@ from browser import CHROMIUM, Browser
 from results import PHYSICAL, correlation, estimate
 from scipy.signal import lfilter
 
+from smp_motor_ident.finding import Finding
 from smp_motor_ident.report import tuning_page, words
 from smp_motor_ident.report.chart import thin
 from smp_motor_ident.report.drawing import ticks
 from smp_motor_ident.report.figures import Comparison, frequency_charts, residual_charts
 from smp_motor_ident.report.html import Report, render
+from smp_motor_ident.report.summary import find_doubted
 from smp_motor_ident.report.tuning_page import tuning_charts
-from smp_motor_ident.result import (
-    ResidualTests,
-)
+from smp_motor_ident.result import Quantity, ResidualTests
 from smp_motor_ident.tune import Loop, design
 from smp_motor_ident.tune.curves import Curves
 
@@ -87,6 +89,46 @@ def test_page_tells_failures_warnings_and_unidentifiable_parameters(page: str) -
     assert "Voltage is constant; excite the motor." in page
     assert "look alike at 100 Hz" in page
     assert all(words.put_within(name) in page.split("Not identifiable")[1] for name in PHYSICAL)
+
+
+@pytest.mark.parametrize(
+    ("message", "evidence", "named"),
+    [
+        ("the data do not tell time_constant: it may be anything", {}, ["time_constant"]),
+        ("the error moves it by 3 deviations", {"quantity": "dc_gain"}, ["dc_gain"]),
+        ("a delay of 3 s", {"time_constant": 0.1}, ["time_constant"]),
+        ("gain and time constant need not be the motor's", {}, ["dc_gain", "time_constant"]),
+        ("the model explains only 60 % of the speed", {"gain": 0.3}, None),
+    ],
+)
+def test_a_finding_puts_in_doubt_what_it_names_and_else_every_number(
+    message: str, evidence: dict[str, float | str | None], named: list[str] | None
+) -> None:
+    known = estimate(current=False)  # gain and time constant
+    grave = Finding("code", "unreliable", message, evidence)
+    doubted = find_doubted(replace(known, findings=(*known.findings, grave)))
+    # The gravest is told first.
+    assert doubted == dict.fromkeys(named or ["dc_gain", "time_constant"], 1)
+
+
+@pytest.mark.parametrize(
+    ("quantity", "number", "between"),
+    [
+        (Quantity(0.0381133, 0.0016, (0.035, 0.0413), "s"), "38.1 ± 1.6 ms", "35.0 … 41.3"),
+        (Quantity(864.0, 5700.0, (0.0, 12345.0), "V"), "900 ± 5700 V", "0 … 12300"),
+        (Quantity(-2.7e-6, 6.6e-6, None, "V"), "(-2.7 ± 6.6)·10⁻⁶ V", "—"),
+        (Quantity(25.5, 3e-13, None, "rad/s/V"), "25.5000000 ± 3.0e-13 rad/s/V", "—"),
+        (Quantity(12.9, status="fixed", unit="ohm"), "12.9 Ω", "—"),
+        (Quantity(None, ci95=(0.0, math.inf), unit="s"), "0 … ∞ ms", "0 … ∞"),
+        (Quantity(None, unit="s"), "—", "—"),
+        (Quantity(0.31, 0.0996, (0.11, 0.5), "1"), "0.31 ± 0.10", "0.11 … 0.50"),
+    ],
+)
+def test_a_number_has_the_digits_that_its_deviation_allows(
+    quantity: Quantity, number: str, between: str
+) -> None:
+    assert words.state(quantity) == number
+    assert words.interval(quantity) == between
 
 
 def test_every_colour_of_the_charts_is_a_variable_of_the_page(page: str) -> None:
