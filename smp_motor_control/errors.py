@@ -4,9 +4,24 @@ Every message names the value (and the file where there is one) and says what to
 """
 
 import math
+import re
 
 LONGEST_MESSAGE = 1000
 """Characters of a message: of a value that is quoted from a spoilt file head and tail are shown."""
+
+
+_TOKEN = "[A-Za-z_][A-Za-z0-9_]*"
+_NAME = re.compile(f"{_TOKEN}(/{_TOKEN})*")
+
+
+def printable(text: str) -> str:
+    """Return a text in one line: whatever else a file or a path holds is replaced."""
+    return "".join(c if c.isprintable() else "\N{REPLACEMENT CHARACTER}" for c in text)
+
+
+def is_ros_name(name: str) -> bool:
+    """Return whether a name may stand in those of topics and nodes, in exports and in paths."""
+    return _NAME.fullmatch(name) is not None
 
 
 class SmpError(Exception):
@@ -16,8 +31,7 @@ class SmpError(Exception):
 
     def __str__(self) -> str:
         """Return the message in one line, without its middle where nobody would read that."""
-        text, half = super().__str__(), LONGEST_MESSAGE // 2
-        text = "".join(c if c.isprintable() else "\N{REPLACEMENT CHARACTER}" for c in text)
+        text, half = printable(super().__str__()), LONGEST_MESSAGE // 2
         return text if len(text) <= LONGEST_MESSAGE else f"{text[:half]} … {text[-half:]}"
 
 

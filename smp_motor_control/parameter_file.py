@@ -7,7 +7,7 @@ from typing import Any
 
 import yaml
 
-from smp_motor_control.errors import ParameterError
+from smp_motor_control.errors import ParameterError, printable
 
 MOST_BYTES = 1_000_000
 """Parsing takes some 10 s per megabyte; a robot's parameter file has a few kilobytes."""
@@ -33,36 +33,42 @@ _Loader.add_implicit_resolver(
 def read_yaml(path: str | Path) -> Any:
     """Read a YAML file of bounded size and depth."""
     try:
+        if not Path(path).is_file() and Path(path).exists():
+            raise ParameterError(f"{path}: is not a file; give a file")
         with Path(path).open("rb") as file:
             data = file.read(MOST_BYTES + 1)
         if len(data) > MOST_BYTES:
             raise ParameterError(f"{path}: is larger than {MOST_BYTES:,} bytes; no parameter file")
-        document = yaml.load(data.decode("utf-8"), Loader=_Loader)
+        return bounded_yaml(data.decode("utf-8"), _Loader)
     except OSError as error:
         raise ParameterError(f"{path}: cannot be read: {error.strerror}") from None
     except (yaml.YAMLError, ValueError, TypeError) as error:
         if isinstance(error, ParameterError):
             raise
         raise ParameterError(f"{path}: is not YAML: {' '.join(str(error).split())}") from None
-    except RecursionError:
-        raise ParameterError(f"{path}: is nested more than {MOST_LEVELS} levels deep") from None
-    _check_size(document, path)
-    return document
 
 
-def _check_size(document: Any, path: str | Path) -> None:
-    pending, nodes = [(document, 0)], 0
-    while pending:
-        value, level = pending.pop()
-        nodes += 1
-        if level > MOST_LEVELS:
-            raise ParameterError(f"{path}: is nested more than {MOST_LEVELS} levels deep")
-        if nodes > MOST_NODES:
-            raise ParameterError(f"{path}: holds more than {MOST_NODES:,} values")
-        if isinstance(value, Mapping):
-            pending.extend((inner, level + 1) for inner in value.values())
-        elif isinstance(value, list):
-            pending.extend((inner, level + 1) for inner in value)
+def bounded_yaml(text: str, loader: Any) -> Any:
+    """Return what a YAML text holds; YAMLError where that is too large before it is built."""
+    total, sizes = 0, dict[str | None, int]()
+    begun: list[tuple[str | None, int]] = []
+    for event in yaml.parse(text, loader):
+        if isinstance(event, yaml.CollectionEndEvent):
+            anchor, before = begun.pop()
+            sizes[anchor] = total - before
+        elif isinstance(event, yaml.AliasEvent):
+            total += sizes.get(event.anchor, 1)
+        elif isinstance(event, yaml.NodeEvent):
+            total += 1
+            sizes[event.anchor] = 1
+            if isinstance(event, yaml.CollectionStartEvent):
+                begun.append((event.anchor, total))
+                sizes[event.anchor] = MOST_NODES  # until it ends: inside itself it has no end
+        if len(begun) > MOST_LEVELS:
+            raise yaml.YAMLError(f"nested more than {MOST_LEVELS} levels deep")
+        if total > MOST_NODES:
+            raise yaml.YAMLError(f"holds more than {MOST_NODES:,} values, each alias counted whole")
+    return yaml.load(text, loader)
 
 
 def read_parameters(path: str | Path) -> dict[str, dict[str, Any]]:
@@ -89,7 +95,9 @@ def _nodes(level: Mapping[Any, Any], place: str, path: str | Path) -> Iterator[t
 def written(nodes: Mapping[str, Mapping[str, Any]], head: Iterable[str] = ()) -> str:
     """Return the text of a ROS parameter file, behind comments."""
     tree = {node: {"ros__parameters": dict(parameters)} for node, parameters in nodes.items()}
-    return "".join(f"# {line}\n" for line in head) + yaml.safe_dump(tree, sort_keys=False)
+    return "".join(f"# {printable(line)}\n" for line in head) + yaml.safe_dump(
+        tree, sort_keys=False
+    )
 
 
 def parameters_of(path: str | Path, node: str) -> dict[str, Any]:

@@ -10,6 +10,7 @@ from smp_motor_control.arrays import Array, Integers
 from smp_motor_control.motor.parameters import Gearbox
 from smp_motor_ident.bag import checks, clock, counter, mapping, units
 from smp_motor_ident.bag.axis import Motor, Series, finite, on_one_axis, unwrapped
+from smp_motor_ident.bag.limits import COUNTED
 from smp_motor_ident.bag.storage import Table
 from smp_motor_ident.diagnosis.stamps import find_beat, moves_on
 from smp_motor_ident.errors import BagError
@@ -32,9 +33,17 @@ def assemble(
     if axis_name is None or "voltage" not in plan.signals:
         missing = "voltage" if axis_name else "velocity, position or count"
         raise BagError(f"{motor.where}: the mapping gives no {missing}")
-    times = _clock(motor)
+    clocks = _clock(motor)
+    arrivals = [topic for topic, time in clocks.items() if time is tables[topic].log]
+    times, leaps = clock.without_leaps(clocks, plan.gap)
+    if leaps:
+        text = (
+            f"the time leaps by up to {_span(max(leaps))} in {len(leaps)} places: the clock was "
+            "set while recording, or these are runs of several days; a new segment each"
+        )
+        motor.tell("clock_set", text, "warning", times=len(leaps), longest=max(leaps))
     if plan.clock == "auto":
-        times = {topic: _on_beat(motor, topic, time) for topic, time in times.items()}
+        times |= {topic: _on_beat(motor, topic, times[topic]) for topic in arrivals}
     given = {name: signal for name, signal in plan.signals.items() if name != "time"}
     series = {n: _series(motor, n, signal, times[signal.topic]) for n, signal in given.items()}
     together = plan.signals["voltage"].topic == plan.signals[axis_name].topic
@@ -48,11 +57,14 @@ def assemble(
     return on_one_axis(motor, series, axis_name)
 
 
+def _span(seconds: float) -> str:
+    days = seconds / 86_400
+    return f"{days / 365.25:.3g} years" if days > 700 else f"{days:.3g} days"
+
+
 def _on_beat(motor: Motor, topic: str, time: Integers) -> Integers:
-    """Return arrival times on the beat of their sender; other times as they are."""
+    """Return arrival times on the beat of their sender, or as they are where there is none."""
     table = motor.tables[topic]
-    if time is not table.log:
-        return time
     together = np.diff(time) == 0
     if together.any():
         alike = [np.diff(column)[together] == 0 for column in table.columns.values()]
@@ -90,7 +102,14 @@ def _check(motor: Motor, series: dict[str, Series]) -> None:
                     f"{motor.where}: the count stays at {last}, where a counter of its width ends: "
                     "it is full; record a wider one, or one that wraps"
                 )
-            value = unwrapped(motor, series).count.astype(np.float64)
+            count = unwrapped(motor, series).count
+            value = (count - count[:1]).astype(np.float64)
+            step = np.quantile(np.abs(np.diff(value)), 0.9) if value.size > 1 else 0.0
+            if step > COUNTED.value and not motor.plan.own:
+                raise BagError(
+                    f"{motor.where}: the count moves by {step:.2g} from sample to sample, which is "
+                    "no encoder's; map the column of its counts"
+                )
         bad = checks.impossible(value, steps_allowed=name in ("voltage", "supply", "current"))
         if bad.any():
             worst = float(np.abs(value[bad]).max())

@@ -162,7 +162,10 @@ def _count_starts(motor: Motor, series: dict[str, Series], keep: Flags, axis_nam
     if axis_name == "count":
         counter = unwrapped(motor, series)
         motor.findings += counter.findings
-        series["count"] = Series(series["count"].time, counter.count)
+        count = counter.count
+        if np.abs(count.astype(np.float64)).max() >= 2.0**53:  # which has no room in a float
+            count = count - count[0]
+        series["count"] = Series(series["count"].time, count)
         flags[counter.resets] = True
     elif axis_name == "position":
         resets = angle_resets(series["position"].value)
@@ -225,7 +228,7 @@ def _gaps(
         text = f"{int(missing[bridged].sum())} samples missing in {int(bridged.sum())} places"
         text += "; their voltage was interpolated" if alike else "; the voltage there is known"
         motor.tell("samples_missing", text, samples=int(missing[bridged].sum()))
-    apart = [f.evidence for f in motor.findings if f.code == "clock_set_back"]  # by the reader
+    apart = [f.evidence for f in motor.findings if f.code in ("clock_set_back", "clock_set")]
     if cut.sum() > sum(float(e.get("times") or 0.0) for e in apart):
         text = f"{int(cut.sum())} gaps of up to {steps[cut].max() * 1e-9:.3g} s"
         text += f" ({int(missing[cut].sum())} samples missing)" if beat.regular else ""

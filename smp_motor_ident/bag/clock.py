@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from smp_motor_control.arrays import Array, Integers
-from smp_motor_ident.bag.limits import SET_BACK
+from smp_motor_ident.bag.limits import CLOCK_LEAP, SET_BACK
 from smp_motor_ident.bag.mapping import Signal
 from smp_motor_ident.bag.storage import Table, found
 from smp_motor_ident.bag.units import UNITS
@@ -273,6 +273,27 @@ def one_after_another(
         for m, part in zip(moved, parts):
             m[slice(*part[k])] += last + pause - first
     return moved
+
+
+def without_leaps(
+    times: Mapping[str, Integers], gap: float
+) -> tuple[dict[str, Integers], list[float]]:
+    """Return times [ns] of one clock without what it was set forward by, and that [s].
+
+    Where no topic has a sample for so long, it is a pause that surely begins a new segment.
+    """
+    every = np.sort(np.concatenate(list(times.values())))
+    steps = np.diff(every.view(np.uint64))  # the farthest two have no signed distance
+    last = np.flatnonzero(steps > CLOCK_LEAP.value * _SECOND)
+    if not last.size:
+        return dict(times), []
+    leaps = steps[last]
+    pause = pause_between(every, [*pairwise([0, *(last + 1).tolist(), every.size])], gap)
+    shift = np.concatenate([[0], np.cumsum(leaps - np.uint64(pause))]).astype(np.int64)
+    moved = {
+        topic: time - shift[np.searchsorted(every[last], time)] for topic, time in times.items()
+    }
+    return moved, (1e-9 * leaps).tolist()
 
 
 def pause_between(time: Integers, parts: Parts, gap: float) -> int:

@@ -1,5 +1,6 @@
 """Counters and angles that wrap around, at which width, and counters that start again."""
 
+import math
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -71,9 +72,10 @@ def wrap_of(value: Array) -> Wrap | None:
 def counts_of(wrap: Wrap, span: int) -> int:
     """Return the roundest width in counts that a wrap admits: a power of two, or of most zeros."""
     spread = 4 * wrap.deviation + 0.5
-    first = max(int(np.ceil(wrap.width - spread)), span + 1)
-    widths = range(first, max(int(wrap.width + spread), first) + 1)
-    return max(widths, key=lambda n: (n & (n - 1) == 0, *(n % r == 0 for r in (1000, 100, 10, 4))))
+    first = max(math.ceil(wrap.width - spread), span + 1)
+    last = max(int(wrap.width + spread), first)
+    power = 1 << (first - 1).bit_length()
+    return next(n for r in (power, 1000, 100, 20, 10, 4, 1) if (n := -(-first // r) * r) <= last)
 
 
 def angle_of(wrap: Wrap) -> float:

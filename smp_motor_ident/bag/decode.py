@@ -48,7 +48,12 @@ class Layout:
 class Decoder:
     """Reads the wanted fields of one channel, by the first candidate that fits a message."""
 
-    KEPT = 64
+    KEPT, FEW = 64, 2
+    """Layouts that are kept; few where nearly every message has one of its own."""
+    TRIED = 200
+    """Messages in a row that are no such messages, behind which none is taken apart any more."""
+    TOGETHER = 1024
+    """Messages that are compared with the layouts at once."""
 
     def __init__(
         self, channel: Channel, candidates: Iterable[Definitions], paths: Sequence[str]
@@ -59,25 +64,33 @@ class Decoder:
         self._steps = [parse_path(path) for path in paths]
         self._candidates = iter(candidates)
         self._layouts: list[Layout] = []
+        self._learned = self._failed = 0
         self.undecodable = 0
         self.reason = ""
 
     def decode(self, batch: Batch) -> list[Part]:
         """Decode a batch; messages that are no such messages are missing and counted."""
+        every = np.arange(len(batch))
+        begins = range(0, every.size, self.TOGETHER)
+        return [p for k in begins for p in self._decode(batch, every[k : k + self.TOGETHER])]
+
+    def _decode(self, batch: Batch, left: NDArray[np.int64]) -> list[Part]:
+        """Decode some messages of a batch."""
         parts: list[Part] = []
-        left: NDArray[np.int64] = np.arange(len(batch))
         while left.size:
             rest = batch.take(left)
             for layout in self._layouts:
                 if (same := layout.matches(rest)).any():
                     parts.append((left[same], _read(rest, same, layout)))
-                    left = left[~same]
+                    left, self._failed = left[~same], 0
                     rest = batch.take(left)
                 if not left.size:
                     break
-            if left.size and not self._learn(rest.message(0)):
-                self.undecodable += 1
-                left = left[1:]
+            if left.size and not (self._failed < self.TRIED and self._learn(rest.message(0))):
+                self._failed += 1
+                others = left.size if self._failed > self.TRIED else 1
+                self.undecodable += others
+                left = left[others:]
         return parts
 
     def _learn(self, data: bytes) -> bool:
@@ -112,7 +125,8 @@ class Decoder:
                 positions.add(text.end - 4)
         words = tuple((at, int.from_bytes(data[at : at + 4], "little")) for at in sorted(positions))
         self._layouts.insert(0, Layout(len(data), words, tuple(numbers)))
-        del self._layouts[self.KEPT :]
+        self._learned, self._failed = self._learned + 1, 0
+        del self._layouts[self.KEPT if self._learned < 16 * self.KEPT else self.FEW :]
         return True
 
 

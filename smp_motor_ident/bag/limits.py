@@ -17,6 +17,19 @@ UNPACKED_RATIO = Limit(
     "cost: 1 GB at most for a file of 10 MB, half of it unpacked bytes; telemetry packs 3 to 20",
     "test_bounds.py",
 )
+WIDEST = Limit(
+    16_384,
+    "1",
+    "cost: columns or topics that are looked at; no spreadsheet has more, and no robot",
+    "test_hostile.py",
+)
+DEFINED = Limit(
+    500_000,
+    "byte",
+    "cost: 1.5 s for one definition of a message type, eight times as much for all of a recording; "
+    "with all that they refer to and their comments real ones have up to 150 kB",
+    "test_hostile.py",
+)
 STRAY_ROWS = Limit(
     0.05,
     "1",
@@ -54,6 +67,13 @@ SET_BACK = Limit(
     "back by more, and as many rows go on from there",
     "test_runs.py",
 )
+CLOCK_LEAP = Limit(
+    86_400.0,
+    "s",
+    "physical: no run pauses for a day; a clock that was set, or another day's run, does not tell "
+    "how long nothing was recorded",
+    "test_timing.py",
+)
 WIDTH_KNOWN = Limit(
     2e-3,
     "1",
@@ -66,6 +86,12 @@ SATURATED = Limit(
     "1",
     "physical: a counter that turns stands at the last number of its width for a sample, a full "
     "one as long as the motor turns on",
+    "test_counter.py",
+)
+COUNTED = Limit(
+    2.0**32,
+    "count",
+    "physical: a million counts a turn at 100,000 rpm are half of it in a second",
     "test_counter.py",
 )
 SECONDS_APART = Limit(

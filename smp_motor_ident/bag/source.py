@@ -9,10 +9,13 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any, cast
 
+import msgspec
 import yaml
 
+from smp_motor_control.errors import printable
+from smp_motor_control.parameter_file import bounded_yaml
 from smp_motor_ident.bag.readers import BAGS, PACKED, TABLES, is_table, open_source
-from smp_motor_ident.bag.readers.format import Messages, Tables
+from smp_motor_ident.bag.readers.format import Messages, Tables, check_width
 from smp_motor_ident.bag.storage import TABLE, Batch, Channel, Table, damaged, found
 from smp_motor_ident.bag.unpack import Budget, folder_of
 from smp_motor_ident.errors import BagError
@@ -22,10 +25,32 @@ _SPLIT = re.compile(r"(.+?)_\d+$")
 _BAG_NAME = re.compile(rf"({'|'.join(map(re.escape, BAGS))})(\.\w+)?$")
 _NAMED_ONLY = (".json", ".txt", ".log", ".dat")
 """Tables that a folder may hold for other reasons: read only when named."""
-_DAMAGE = (ValueError, AttributeError, OSError, RecursionError, MemoryError)
 _LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
-_DEEPEST = 50
-"""Levels of a metadata.yaml; a real one has six, and libyaml's loader dies of some ten thousand."""
+_MOST_BYTES = 1 << 24
+"""Of a metadata.yaml that are read; one with a thousand topics has some 500 kB."""
+
+
+class _Topic(msgspec.Struct):
+    name: str
+
+
+class _Counted(msgspec.Struct):
+    """One topic of a metadata.yaml; the oldest bags call its entry differently."""
+
+    message_count: int
+    topic_metadata: _Topic | None = None
+    topic_and_type: _Topic | None = None
+
+
+class _Information(msgspec.Struct):
+    """What of a metadata.yaml is used, in every version of it."""
+
+    relative_file_paths: list[str]
+    topics_with_message_count: list[_Counted] | None = None
+
+
+class _Metadata(msgspec.Struct):
+    rosbag2_bagfile_information: _Information
 
 
 @dataclass
@@ -40,6 +65,9 @@ class Recording:
     # Whether it was found in a folder with others, so that nobody asked for it by name
     one_of_many: bool = False
     _sources: dict[Path, Messages | Tables | None] = field(default_factory=dict, repr=False)
+
+    def __post_init__(self) -> None:
+        self.name = printable(self.name)
 
     @property
     def is_table(self) -> bool:
@@ -62,6 +90,8 @@ class Recording:
             if (source := self._source(path)) is not None:
                 every += [replace(c, topic=self._topic(path, c)) for c in source.channels()]
                 self._note(*source.problems)
+        check_width(len({c.topic for c in every}), self.name, "topics")
+        check_width(sum(len(c.fields) for c in every), self.name)
         return every
 
     def _topic(self, path: Path, channel: Channel) -> str:
@@ -139,6 +169,8 @@ def recordings(paths: Any, topics: Collection[str] = ()) -> list[Recording]:
     for path in map(Path, paths):
         if not path.exists():
             raise BagError(f"{path}: does not exist")
+        if not (path.is_dir() or path.is_file()):
+            raise BagError(f"{path}: is a pipe or a device; save what it gives as a file")
         try:
             inside = _of_folder(path) if path.is_dir() else [Recording(path.name, [path])]
         except OSError as error:
@@ -165,16 +197,30 @@ def _joined(every: list[Recording], topics: Collection[str]) -> list[Recording]:
     return [whole, *(r for r in every if r not in parts and not r.is_table)]
 
 
-def _of_folder(path: Path) -> list[Recording]:
-    """Return the recordings of a folder: one bag, or what lies in it."""
-    if (path / "metadata.yaml").is_file():
-        return [_bag(path)]
-    here = sorted(p for p in path.iterdir() if p.is_file())
+def _of_folder(top: Path) -> list[Recording]:
+    """Return the recordings of a folder: one bag, or what lies in it; a link back is none."""
+    every: list[Recording] = []
+    waiting, seen = [top], set[tuple[int, int]]()
+    while waiting:
+        path = waiting.pop()
+        if (place := (path.stat().st_dev, path.stat().st_ino)) in seen:
+            continue
+        seen.add(place)
+        if (path / "metadata.yaml").is_file():
+            every.append(_bag(path))
+            continue
+        here = sorted(path.iterdir())
+        every += _of_files(path.resolve().name, [p for p in here if p.is_file()])
+        waiting += [p for p in reversed(here) if p.is_dir() and not p.name.startswith(".")]
+    return every
+
+
+def _of_files(name: str, here: Sequence[Path]) -> list[Recording]:
+    """Return the recordings among the files of a folder without metadata."""
     groups: dict[str, list[Path]] = {}
     for file in _storages(here):
         split = _SPLIT.match(_stem(file))
         groups.setdefault(split[1] if split else _stem(file), []).append(file)
-    name = path.resolve().name
     text = f"{name}: has no metadata.yaml; all its files are read"
     every = []
     for key, files in groups.items():
@@ -182,10 +228,7 @@ def _of_folder(path: Path) -> list[Recording]:
         whole = name if len(groups) == 1 else f"{name}/{key}"
         every.append(Recording(whole, sorted(files, key=_order), findings=amiss))
     tables = [s for s in TABLES if s not in _NAMED_ONLY]
-    every += [Recording(p.name, [p]) for p in here if p.suffix.lower() in tables]
-    for folder in sorted(p for p in path.iterdir() if p.is_dir() and not p.name.startswith(".")):
-        every += _of_folder(folder)
-    return every
+    return every + [Recording(p.name, [p]) for p in here if p.suffix.lower() in tables]
 
 
 def _storages(files: Iterable[Path]) -> list[Path]:
@@ -205,27 +248,18 @@ def _order(path: Path) -> tuple[str, int]:
     return match[1], int(match[2] or 0)
 
 
-def _loaded(text: str) -> Any:
-    """Return what a YAML text holds; what is nested too deep is refused before it is built."""
-    depth = 0
-    for event in yaml.parse(text, _LOADER):
-        depth += isinstance(event, yaml.CollectionStartEvent)
-        depth -= isinstance(event, yaml.CollectionEndEvent)
-        if depth > _DEEPEST:
-            raise yaml.YAMLError(f"nested more than {_DEEPEST} deep")
-    return yaml.load(text, _LOADER)
-
-
 def _bag(path: Path) -> Recording:
     """Return a bag by its metadata.yaml, of any version, as far as it can be trusted."""
     name = path.resolve().name
     bag = Recording(name, [])
     try:
-        text = (path / "metadata.yaml").read_text("utf-8", "replace")
-        information = _loaded(text)["rosbag2_bagfile_information"]
-        listed = [Path(str(file)).name for file in information["relative_file_paths"]]
+        with (path / "metadata.yaml").open("rb") as metadata:
+            text = metadata.read(_MOST_BYTES).decode("utf-8", "replace")
+        given = msgspec.convert(bounded_yaml(text, _LOADER), _Metadata)
+        information = given.rosbag2_bagfile_information
+        listed = [Path(file).name for file in information.relative_file_paths]
         bag.declared = _declared(information)
-    except (yaml.YAMLError, LookupError, TypeError, ArithmeticError, *_DAMAGE) as error:
+    except (yaml.YAMLError, ValueError, OSError, ArithmeticError) as error:
         reason = " ".join(str(error).split())[:200] or type(error).__name__
         bag.findings.append(
             damaged(f"{name}: metadata.yaml is damaged ({reason}); all files are read")
@@ -253,10 +287,10 @@ def _bag(path: Path) -> Recording:
     return bag
 
 
-def _declared(information: dict[str, Any]) -> dict[str, int]:
-    """Return the messages by topic; the oldest bags call the topic's entry differently."""
+def _declared(information: _Information) -> dict[str, int]:
+    """Return the messages by topic."""
     counts: Counter[str] = Counter()
-    for entry in information.get("topics_with_message_count") or []:
-        topic = entry.get("topic_metadata") or entry.get("topic_and_type") or {}
-        counts[str(topic["name"])] += int(entry["message_count"])
+    for entry in information.topics_with_message_count or ():
+        if (topic := entry.topic_metadata or entry.topic_and_type) is not None:
+            counts[topic.name] += entry.message_count
     return dict(counts)

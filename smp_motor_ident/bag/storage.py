@@ -44,6 +44,8 @@ class Channel:
     units: Mapping[str, str] = field(default_factory=dict, hash=False)
     # Words of a column that tells motors apart, in the order of the numbers that stand for them
     words: Mapping[str, tuple[str, ...]] = field(default_factory=dict, hash=False)
+    # Of the wheel [m] whose rotation the file tells in units of length; 0 where it does not
+    wheel_radius: float = 0.0
     lengths: tuple[int, ...] = ()  # how many values each column has, where they differ
 
 

@@ -8,6 +8,7 @@ from itertools import product
 import numpy as np
 
 from smp_motor_control.arrays import Flags, Integers
+from smp_motor_control.errors import is_ros_name
 from smp_motor_ident.bag import clock, limits, units
 from smp_motor_ident.bag.mapping import DEFAULT_MOTOR, MotorMap, Signal, SignalMap
 from smp_motor_ident.bag.names import MOTIONS, tells_motors
@@ -27,6 +28,9 @@ TIME_NAMES = (
 EPOCHS = ((1e17, "ns"), (1e14, "us"), (1e11, "ms"))
 """A number of time beyond each is of today in that unit since 1970."""
 
+ROUNDED = 0.01
+"""A radius that is given as the file's within so much is that of the file, which is not rounded."""
+
 _WHEELS = ((DEFAULT_MOTOR, ""), ("left", "left_"), ("right", "right_"))
 
 
@@ -38,11 +42,19 @@ def is_time_of_part(path: str) -> bool:
 
 def resolved(plan: MotorMap, channels: list[Channel]) -> MotorMap:
     """Return a plan whose signals name topics and fields as the files do."""
-    tables = [channel for channel in channels if channel.encoding == TABLE]
-    if not tables:
-        return plan
-    signals = {name: _resolved(name, signal, tables) for name, signal in plan.signals.items()}
+    signals = {name: _of_topic(signal, channels) for name, signal in plan.signals.items()}
+    if tables := [channel for channel in channels if channel.encoding == TABLE]:
+        signals = {name: _resolved(name, signal, tables) for name, signal in signals.items()}
     return replace(plan, signals=signals)
+
+
+def _of_topic(signal: Signal, channels: list[Channel]) -> Signal:
+    """Return a signal whose whole name was in quotes with its topic, where one begins so."""
+    for channel in channels if not signal.topic else ():
+        _, begins, field = signal.field.partition(f"{channel.topic}.")
+        if channel.topic.startswith("/") and begins and (not _):
+            return replace(signal, topic=channel.topic, field=field)
+    return signal
 
 
 def _resolved(name: str, signal: Signal, tables: list[Channel]) -> Signal:
@@ -85,6 +97,8 @@ def self_described(recording: Recording, asked: SignalMap) -> dict[str, MotorMap
             signals = {name: Signal(channel.topic, column) for name, column in named.items()}
             signals["time"] = Signal(channel.topic, "time")
             given = asked.motors.get(wheel, asked.defaults)
+            if abs(given.wheel_radius / (channel.wheel_radius or np.inf) - 1) < ROUNDED:
+                given = replace(given, wheel_radius=channel.wheel_radius)
             plans[wheel] = resolved(replace(given, signals=signals), channels)
     if plans:
         return plans
@@ -144,8 +158,11 @@ def apart(
             numbers, counts = numbers[counts > stray], counts[counts > stray]
             if numbers.size < 2 or of.size - counts.sum() > stray:
                 continue
-            own = [labels[int(n)] if labels else f"motor_{n:g}" for n in numbers]
-            own = [re.sub(r"\W+", "_", name).strip("_") for name in own]
+            own = [
+                re.sub(r"\W+", "_", labels[int(n)]).strip("_") if labels else "" for n in numbers
+            ]
+            if len(set(filter(is_ros_name, own))) < len(own):
+                own = [f"motor_{re.sub('[.-]', '_', f'{n:g}')}" for n in numbers]
             text = f"{recording.name}: {column} tells {len(own)} motors apart: {', '.join(own)}"
             finding = found("several_motors", text, motors=len(own))
             motors = [_rows(tables[topic], of == n, finding) for n in numbers]

@@ -18,7 +18,7 @@ from smp_motor_ident.errors import BagError
 _NUMPYS = ("float32", "float64", *(f"{u}int{bits}" for u in ("", "u") for bits in (8, 16, 32, 64)))
 _KINDS = {name: np.dtype(name).str[1:] for name in _NUMPYS}
 _KINDS |= dict.fromkeys(("bool", "byte", "char", "octet"), "u1")
-_MOST_ELEMENTS = 100_000
+_MOST_ELEMENTS = 100_000  # messages inside one; all that have bytes of their own need some
 _STEP = re.compile(r"(\w+)((?:\[[^\]]*\])*)")
 
 
@@ -84,7 +84,7 @@ class _Parser:
         self.ros1 = ros1
         self.order = "<" if ros1 or data[1] else ">"
         self.lengths: list[int] = []
-        self.left = _MOST_ELEMENTS
+        self.left = min(_MOST_ELEMENTS, 64 + 4 * len(data))
 
     def parse(self, name: str) -> Template:
         root = self.message(name)
@@ -99,7 +99,7 @@ class _Parser:
             self.take(1, 1)
         self.left -= 1
         if self.left < 0:
-            raise DecodeError(f"it has more than {_MOST_ELEMENTS} parts")
+            raise DecodeError("it has more parts than it can hold")
         return {key: self.value(description) for key, description in fields}
 
     def value(self, description: Any) -> Any:

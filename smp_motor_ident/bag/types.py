@@ -11,6 +11,7 @@ from rosbags import typesys
 from rosbags.interfaces import Nodetype
 from rosbags.typesys import Stores, TypesysError, get_typestore
 
+from smp_motor_ident.bag.limits import DEFINED
 from smp_motor_ident.bag.storage import Channel, first_line, message_type
 from smp_motor_ident.errors import BagError
 
@@ -28,6 +29,9 @@ _LINE = "=" * 80 + "\n"
 @lru_cache(maxsize=512)
 def _parse(text: str, name: str, form: str) -> dict[str, Fields]:
     """Return the fields of all messages that a definition text holds."""
+    text = "\n".join(filter(str.strip, text.splitlines()))  # many empty lines would take hours
+    if len(text) > DEFINED.value:
+        raise BagError(f"its definition has {len(text)} characters, more than {DEFINED.value:.0f}")
     if form == "ros2idl" or text.startswith(_LINE + "IDL: "):
         types: dict[str, Any] = {}
         parts = text.split(_LINE)[1:] if text.startswith(_LINE) else [f"IDL:\n{text}"]
@@ -69,9 +73,13 @@ class Types:
 
     def __init__(self, files: Iterable[str | os.PathLike[str]] = ()) -> None:
         self._given: dict[str, Fields] = {}
+        self._seen: set[str] = set()
+        self._left = 8 * DEFINED.value
         for given in files:
             path = Path(given)
-            found = sorted(path.rglob("*.msg")) if path.is_dir() else [path]
+            found = (
+                sorted(p for p in path.rglob("*.msg") if p.is_file()) if path.is_dir() else [path]
+            )
             if not found or not found[0].is_file():
                 raise BagError(f"{path}: no .msg file there")
             for file in found:
@@ -95,6 +103,7 @@ class Types:
         stores: list[Lookup] = [partial(_stored, which) for which in _STORES]
         if channel.definition:
             try:
+                self._count(channel.definition)
                 own = _parse(channel.definition, name, channel.definition_format)
                 yield self._closed(name, [own.get, self._given.get, *stores])
             except _SPOILT as error:
@@ -111,6 +120,13 @@ class Types:
                 f"{channel.topic}: the message type {name or '(none)'!r} is unknown "
                 f"({reasons[0]}); give its definition as .msg files"
             )
+
+    def _count(self, text: str) -> None:
+        """Refuse definitions that take too long together."""
+        self._left -= 0 if text in self._seen else len(text)
+        self._seen.add(text)
+        if self._left < 0:
+            raise BagError(f"definitions have more than {8 * DEFINED.value:.0f} characters")
 
     def _named(self, name: str) -> dict[str, Fields]:
         """Return a definition by the type's last name where the user's folder says no package."""

@@ -32,10 +32,11 @@ _ROWS: tuple[tuple[str, Mapping[str, int], dict[str, float]], ...] = (
     ("current", {}, {"A": 1.0, "mA": 1e-3}),
     ("velocity", {}, {"rad/s": 1.0, "deg/s": _TURN / 360, "rpm": _TURN / 60, "rev/s": _TURN}),
     ("velocity", {}, {"Hz": _TURN, "mrad/s": 1e-3, "rad/min": 1 / 60, "deg/min": _TURN / 21600}),
-    ("velocity", _RIM, {"m/s": 1.0, "mm/s": 1e-3, "cm/s": 1e-2, "km/h": 1 / 3.6, "ft/s": 0.3048}),
+    ("velocity", _RIM, {"m/s": 1.0, "mm/s": 1e-3, "cm/s": 1e-2, "km/h": 1 / 3.6}),
+    ("velocity", _RIM, {"ft/s": 0.3048, "in/s": 0.0254}),
     ("velocity", _COUNTS, {"ticks/s": _TURN}),
     ("position", {}, {"rad": 1.0, "deg": _TURN / 360, "rev": _TURN, "mrad": 1e-3}),
-    ("position", _RIM, {"m": 1.0, "mm": 1e-3, "cm": 1e-2, "ft": 0.3048}),
+    ("position", _RIM, {"m": 1.0, "mm": 1e-3, "cm": 1e-2, "ft": 0.3048, "in": 0.0254}),
     ("position", _COUNTS, {"ticks": _TURN}),
     ("count", {}, {"ticks": 1.0}),
     ("time", {}, {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "min": 60.0}),
@@ -113,7 +114,7 @@ def unit_of(signal: str, written: str, name: str) -> str:
         except BagError:
             continue
         # What a name may call the signal itself is no unit.
-        if written or unit not in ("", next(iter(UNITS[signal])), "duty", "pwm"):
+        if written or unit not in ("", next(iter(UNITS[signal])), "duty", "pwm", "in", "in/s"):
             return unit
     return ""
 

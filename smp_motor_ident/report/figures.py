@@ -16,6 +16,9 @@ VIEW = 80.0  # lags of the motor that a screen shows at first: single answers ar
 COHERENT = 0.6
 """Below this coherence most of what a frequency shows is not the answer to the voltage."""
 
+PAUSE = 20.0
+"""Intervals without a sample, behind which a spectrum begins anew."""
+
 Role = Literal["estimation", "validation"]
 
 
@@ -144,6 +147,15 @@ def _degrees(response: Array) -> Array:
     return np.asarray(np.rad2deg(np.unwrap(np.angle(response))))
 
 
+def _without_pauses(part: Comparison, step: float) -> list[tuple[Array, ...]]:
+    """Return time, voltage, measured and simulated speed of the pieces between pauses."""
+    known = np.isfinite(part.measured) & np.isfinite(part.simulated)
+    whole = (part.time, part.voltage, part.measured, part.simulated)
+    columns = [column[known] for column in whole]
+    begins = np.flatnonzero(np.diff(columns[0]) > PAUSE * step) + 1
+    return [*zip(*(np.split(column, begins) for column in columns))] if known.any() else []
+
+
 def _response(parts: Sequence[Comparison]) -> tuple[Array, Array, Array, Array] | None:
     """Return frequencies, response of data and model, and 95 % of the log of the former.
 
@@ -152,21 +164,18 @@ def _response(parts: Sequence[Comparison]) -> tuple[Array, Array, Array, Array] 
     J. S. Bendat, A. G. Piersol, *Random Data*, 4th ed., section 9.2.4: the relative deviation of
     a response with coherence g over n averages is ``sqrt((1 - g) / (2 n g))``.
     """
-    longest = max(parts, key=lambda part: part.time.size)
-    step = float(np.median(np.diff(longest.time)))
-    size = int(2 ** np.floor(np.log2(max(longest.time.size / 4, 1))))
+    step = float(np.median(np.diff(max(parts, key=lambda part: part.time.size).time)))
+    pieces = [piece for part in parts for piece in _without_pauses(part, step)]
+    longest = max((time.size for time, *_ in pieces), default=0)
+    size = int(2 ** np.floor(np.log2(max(longest / 4, 1))))
     if size < 64 or step <= 0:
         return None
     window = np.hanning(size)
     sums = np.zeros((4, size // 2 + 1), dtype=np.complex128)
     averages = 0
-    for part in parts:
-        even = np.arange(part.time[0], part.time[-1], step)
-        ok = np.isfinite(part.measured) & np.isfinite(part.simulated)
-        if ok.sum() < size:
-            continue
-        columns = (part.voltage, part.measured, part.simulated)
-        signals = [np.interp(even, part.time[ok], y[ok]) for y in columns]
+    for time, *columns in pieces:
+        even = np.arange(time[0], time[-1], step)
+        signals = [np.interp(even, time, y) for y in columns]
         for first in range(0, even.size - size + 1, size // 2):
             cut = [s[first : first + size] for s in signals]
             u, y, z = (np.fft.rfft(window * (c - c.mean())) for c in cut)

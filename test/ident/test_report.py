@@ -257,6 +257,15 @@ def test_frequency_response_of_data_is_that_of_the_system_they_come_from() -> No
     np.testing.assert_allclose(gain.curves[0].y[low], truth[low], rtol=0.01)
 
 
+def test_frequency_response_costs_nothing_for_a_pause_of_years() -> None:
+    whole = comparison("estimation")
+    later = np.arange(whole.time.size) >= 2000
+    part = replace(whole, time=whole.time + 1.7e9 * later)  # 340 billion intervals
+    gain, _ = frequency_charts("w", [part])
+    usual, _ = frequency_charts("w", [whole])
+    assert gain.x[-1] == pytest.approx(usual.x[-1], rel=0.2)
+
+
 @pytest.mark.parametrize(("low", "high"), [(0.0, 46.0), (-3.2, 3.2), (1e-7, 2e-7)])
 def test_ticks_are_round_and_inside(low: float, high: float) -> None:
     found = ticks(low, high)

@@ -18,8 +18,6 @@ from smp_motor_ident.bag.unpack import Budget
 from smp_motor_ident.errors import BagError
 
 _COMMENTS = ("#", "%", "//")
-_MATRIX = re.compile(r"^\s*\[(?=[\s\d.+-])|(?<=\d)\s*\]?;?\s*$|^\];?\s*$")
-"""What stands around the rows of a matrix or of lists."""
 _ARROW, _TIME = " -> ", re.compile(r"\d\d?:\d\d:\d\d")
 _WORD = r"[A-Za-z_]\w*"
 _LABEL = re.compile(
@@ -28,6 +26,7 @@ _LABEL = re.compile(
 """What a serial plotter's or a debug output's rows have before every number."""
 _UNIT = re.compile(r"(?<=\d) ?([A-Za-z%°µ][\w%°µ/]*)(?=\s*(?:[,;|]|$))")
 """And what may stand behind one: ``Speed: 33 rpm, Duty: 40%``."""
+_LONGEST = 4096  # characters of a row that may have labels
 
 
 class _CsvFile(Tables):
@@ -42,8 +41,10 @@ class _CsvFile(Tables):
         seen = filled[:60]
         if sum(map(_is_quoted_row, (self._lines[k] for k in seen))) > len(seen) / 2:
             self._lines = [s.strip()[1:-1] if _is_quoted_row(s) else s for s in self._lines]
+        if all(self._lines[k].rstrip().endswith(";") for k in seen):
+            self._lines = [s.rstrip().removesuffix(";") for s in self._lines]
         if any(self._lines[k].lstrip().startswith("[") for k in seen):
-            self._lines = [_MATRIX.sub("", s) for s in self._lines]
+            self._lines = [_without_brackets(s) for s in self._lines]
         usual = self._lines[seen[len(seen) // 2]]
         if _ARROW in usual:  # behind a serial monitor's time of arrival
             mark = next((c for c in ";\t," if c in usual), " ")
@@ -97,11 +98,9 @@ class _CsvFile(Tables):
         fast = self._fast(body, use)
         if fast is not None:
             return Table(None, None, dict(zip(fields, fast)))
-        numbered = [(k, s) for k, s in enumerate(body, self._first + 1) if not s.startswith("#")]
-        rows = [_row(s, self._separator) for _, s in numbered]
-        values, findings, dates = grid.columns(
-            rows, use, fields, str(self.path), [k for k, _ in numbered]
-        )
+        lines = [k for k, s in enumerate(body, self._first + 1) if not s.startswith("#")]
+        rows = [_row(s, self._separator) for s in body if not s.startswith("#")]
+        values, findings, dates = grid.columns(rows, use, fields, str(self.path), lines)
         columns = dict(zip(fields, values))
         return Table(None, None, columns, findings=findings, exact=frozenset(dates))
 
@@ -117,13 +116,15 @@ class _CsvFile(Tables):
             )
         except ValueError:
             return None
-        if not values.size or np.nanmax(np.abs(values), initial=0.0) >= 2.0**53:
+        if not values.size or np.max(np.abs(values), where=~np.isnan(values), initial=0) >= 2.0**53:
             return None
         return [values[:, k].copy() for k in range(len(use))]
 
     def _labels(self, seen: list[int]) -> tuple[list[str], list[int]]:
         """Take the labels off rows that have one before every number; return them and such rows."""
         usual = self._lines[seen[len(seen) // 2]]
+        if len(usual) > _LONGEST:
+            return [], seen
         labels: list[str] = _LABEL.findall(usual)
         alike = [k for k in seen if labels and _LABEL.findall(self._lines[k]) == labels]
         bare = [_bare(self._lines[k]) for k in alike]
@@ -163,6 +164,12 @@ class _CsvFile(Tables):
         marks = [*self._separator.strip(), *";\t|,", *[None][: self._separator == " "]]
         several = [[cell.strip(' \t"') for cell in text.split(mark)] for mark in marks]
         return next((c for c in several if len(c) == width and all(c)), [])
+
+
+def _without_brackets(line: str) -> str:
+    """Return a row of a matrix or of lists without what stands around it."""
+    text = line.strip().removesuffix(";").removesuffix("]")
+    return text[1:] if text[:1] == "[" and text[1:2].strip("0123456789.+-") == "" else text
 
 
 def _bare(line: str) -> str:

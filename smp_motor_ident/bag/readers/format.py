@@ -2,17 +2,27 @@
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from smp_motor_ident.bag.limits import WIDEST
 from smp_motor_ident.bag.storage import TABLE, Batch, Channel, Table, damaged
 from smp_motor_ident.bag.unpack import Budget
 from smp_motor_ident.errors import BagError
 from smp_motor_ident.finding import Finding
+
+
+def check_width(count: int, name: str, what: str = "columns") -> None:
+    """Refuse what has more columns or topics than any log of a robot."""
+    if count > WIDEST.value:
+        raise BagError(
+            f"{name}: has more than {WIDEST.value:.0f} {what}, as no log of a robot; keep those of "
+            "the motors"
+        )
 
 
 class Source(ABC):
@@ -83,21 +93,25 @@ class ColumnFile(Tables):
         units: Mapping[str, str] | None = None,
         dates: Collection[str] = (),
         problems: Sequence[Finding] = (),
+        wheel_radius: float = 0.0,
     ) -> None:
         super().__init__(path, name)
         self.problems += problems
         if not columns:
             raise BagError(f"{name}: holds no column of numbers")
+        check_width(len(columns), name)
         self._columns = columns
         self._units = units or {}
         self._dates = dates
+        self._radius = wheel_radius
 
     def channels(self) -> list[Channel]:
         """Return the one table."""
         lengths = tuple(column.size for column in self._columns.values())
         lengths = lengths if len(set(lengths)) > 1 else ()
         fields = tuple(self._columns)
-        return [Channel(0, "", "", TABLE, fields=fields, units=self._units, lengths=lengths)]
+        channel = Channel(0, "", "", TABLE, fields=fields, units=self._units, lengths=lengths)
+        return [replace(channel, wheel_radius=self._radius)]
 
     def table(self, topic: str, fields: Sequence[str]) -> Table:
         """Return columns; all must have the same length."""

@@ -1,6 +1,7 @@
 """Rows of cells as spreadsheets and loggers write them: names, units, numbers, times."""
 
 import re
+from array import array
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -11,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from smp_motor_ident.bag.limits import STRAY_ROWS
+from smp_motor_ident.bag.readers.format import check_width
 from smp_motor_ident.bag.storage import found
 from smp_motor_ident.bag.units import written_unit
 from smp_motor_ident.errors import BagError
@@ -28,6 +30,9 @@ _ISO = re.compile(
 )
 _BRACKETS = re.compile(r"\s*[\[(]([^\])]*)[\])]\s*$")
 _SEEN = 60  # rows that are looked at to tell names from numbers
+_SOME = 1000  # cells of a row, and rows without a number, behind which no more are looked at
+_LONGEST = 200  # characters of a column's name
+_YEARS = range(1678, 2262)  # that nanoseconds in 64 bits can tell
 
 
 @dataclass
@@ -53,6 +58,7 @@ def head(rows: Sequence[Row], where: str) -> Grid:
     if first is None:
         raise BagError(f"{where}: has no rows of numbers")
     width = len(seen[first])
+    check_width(width, where)
     above = [row for row in seen[:first] if sum(not _empty(c) for c in row) > width / 2]
     if not above:
         names = [f"c{k}" for k in range(1, width + 1)]
@@ -61,18 +67,19 @@ def head(rows: Sequence[Row], where: str) -> Grid:
     named, given = above[-1], [""] * width
     if len(above) > 1 and all(_empty(c) or written_unit(_bare(c)) is not None for c in above[-1]):
         named, given = above[-2], [_bare(c) for c in above[-1]]
-    names, units = [], {}
+    units: dict[str, str] = {}
+    columns: dict[str, int] = {}
     for k in range(width):
         text = str(named[k]).strip() if k < len(named) and not _empty(named[k]) else f"c{k + 1}"
-        text = text if text not in names else f"{text}_{k + 1}"
-        names.append(text)
+        text = text[:_LONGEST] if text[:_LONGEST] not in columns else f"{text[:_LONGEST]}_{k + 1}"
+        columns[text] = k
         bracket = _BRACKETS.search(text)
         unit = written_unit(given[k] if k < len(given) else "") or (
             written_unit(bracket[1]) if bracket else None
         )
-        if unit:
-            units[text] = unit
-    return Grid(names, units, first)
+        if unit or str(seen[first][k]).endswith("%"):
+            units[text] = unit or "%"
+    return Grid(list(columns), units, first)
 
 
 def numeric(names: Sequence[str], rows: Sequence[Row]) -> tuple[str, ...]:
@@ -113,7 +120,7 @@ def is_data(row: Row) -> bool:
 
 def share_of_numbers(row: Row) -> float:
     """Return how many of a row's cells that are not empty are numbers."""
-    sound = [_sound(cell) for cell in row if not _empty(cell)]
+    sound = [_sound(cell) for cell in row[:_SOME] if not _empty(cell)]
     return sum(sound) / max(len(sound), 1)
 
 
@@ -144,6 +151,8 @@ def number(cell: Any) -> float:
             return np.nan
         if lower in _WORDS:
             return float(_WORDS[lower])
+        if text.endswith("%"):
+            return number(text[:-1])
         if text.count(",") == 1:
             return float(text.replace(",", "."))
         return nanoseconds(cell) * 1e-9
@@ -154,15 +163,15 @@ def nanoseconds(cell: Any) -> int:
     if isinstance(cell, (datetime, date, time)):
         cell = cell.isoformat()
     match = _ISO.fullmatch(str(cell).strip())
-    if match is None:
+    if match is None or (match[1] and int(match[1][:4]) not in _YEARS):
         raise ValueError(f"{cell!r} is neither number nor time")
-    day, clock, zone = match[1] or "1970-01-01", match[2].replace(",", "."), match[3] or "Z"
-    clock = clock if clock[2] == ":" else f"0{clock}"
-    stamp = int(np.datetime64(f"{day}T{clock}", "ns").astype(np.int64))
-    if zone != "Z":
-        hours, minutes = int(zone[1:3]), int(zone[-2:])
-        stamp -= (1 if zone[0] == "+" else -1) * (hours * 60 + minutes) * 60_000_000_000
-    return stamp
+    days = int(np.datetime64(match[1] or "1970-01-01", "D").astype(np.int64))
+    hours, minutes, seconds = re.split(":", match[2].replace(",", "."))
+    whole, _, part = seconds.partition(".")
+    zone = match[3] if match[3] not in (None, "Z") else "+00:00"
+    shift = (1 if zone[0] == "+" else -1) * (60 * int(zone[1:3]) + int(zone[-2:]))
+    since = (24 * days + int(hours)) * 60 + int(minutes) - shift
+    return (60 * since + int(whole)) * 10**9 + int(part.ljust(9, "0"))
 
 
 def columns(
@@ -173,29 +182,31 @@ def columns(
     Rows that are no rows of numbers, such as a name in their midst, are left out with a finding;
     ``lines`` are the rows' for messages.
     """
-    kept: list[list[float]] = []
-    stray: list[tuple[int, str]] = []
+    kept = array("d")
+    stray: list[int] = []
     sound_rows: list[Row] = []
     last = 0  # that is one of numbers
     for k, row in enumerate(rows):
         if all(_empty(cell) for cell in row):
             continue
         try:
-            kept.append([number(row[j]) if j < len(row) else np.nan for j in use])
+            kept.extend([number(row[j]) if j < len(row) else np.nan for j in use])
             sound_rows.append(row)
             last = k
         except (ValueError, OverflowError):
-            stray.append((k, _culprit(row, use, names)))
+            stray.append(k)
+            if len(stray) > _SOME and not kept:
+                break
     # Notes that follow the table are no part of it.
-    inside = [one for one in stray if one[0] < last or 2 * len(rows[one[0]]) > len(rows[last])]
-    if len(inside) > STRAY_ROWS.value * (len(kept) + len(inside)):
-        k, what = inside[0]
-        raise BagError(f"{where}: line {lines[k]}, {what}")
+    inside = [k for k in stray if k < last or 2 * len(rows[k]) > len(rows[last])]
+    if len(inside) > STRAY_ROWS.value * (len(sound_rows) + len(inside)):
+        k = inside[0]
+        raise BagError(f"{where}: line {lines[k]}, {_culprit(rows[k], use, names)}")
     findings = []
     if stray:
         text = f"{where}: {len(stray)} rows that are no numbers were left out, the first in line "
-        findings.append(found("stray_rows", f"{text}{lines[stray[0][0]]}", "warning"))
-    values = np.array(kept, np.float64).reshape(len(kept), len(use))
+        findings.append(found("stray_rows", f"{text}{lines[stray[0]]}", "warning"))
+    values = np.array(kept).reshape(len(sound_rows), len(use))
     exact = [_whole(sound_rows, j, values[:, n]) for n, j in enumerate(use)]
     dates = {name for name, (_, timed) in zip(names, exact) if timed}
     return [column for column, _ in exact], findings, dates

@@ -1,34 +1,52 @@
 """JSON logs: rows of objects, objects of columns, JSON lines, and WPILib's SysId.
 
 SysId and its forerunner frc-characterization keep lists of rows by the name of the test
-(``slow-forward`` and the like); what their columns are follows from the number of them
-(github.com/wpilibsuite/sysid, docs/data-collection.md).
+(``slow-forward`` and the like); what their columns are follows from the number of them.
+
+References
+----------
+github.com/wpilibsuite/sysid: docs/data-collection.md (rows and units), AnalysisManager.cpp
+(``unitsPerRotation``); github.com/wpilibsuite/frc-characterization: data_logger.py,
+data_analyzer.py, Robot.java.mako (its rows, and since when they are in rotations).
 """
 
 import json
 from collections.abc import Iterator, Mapping
-from itertools import chain
+from itertools import chain, islice
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from smp_motor_ident.bag.limits import STRAY_ROWS
+from smp_motor_ident.bag.limits import STRAY_ROWS, WIDEST
 from smp_motor_ident.bag.readers import grid
 from smp_motor_ident.bag.readers.format import ColumnFile, Format
 from smp_motor_ident.bag.storage import damaged
+from smp_motor_ident.bag.units import UNITS, needs
 from smp_motor_ident.bag.unpack import Budget
 from smp_motor_ident.errors import BagError
 
 _TESTS = ("slow-forward", "slow-backward", "fast-forward", "fast-backward")
-_SIMPLE = ("time", "voltage", "position", "velocity")
-_SIDES = tuple(f"{side}_{what}" for what in _SIMPLE[1:] for side in ("left", "right"))
-_DRIVE = ("time", *_SIDES, "angle", "angular_rate")
-_OLD = ("time", "battery", "autospeed", *_SIDES, "gyro")
+_ONE_MOTOR = ("Simple", "Arm", "Elevator")
+_SIGNALS = ("voltage", "position", "velocity")
+_SIDES = tuple(f"{side}_{what}" for what in _SIGNALS for side in ("left", "right"))
+_OLD = ("time", "battery", "autospeed")
+_FORMS = {
+    **dict.fromkeys(((True, 4), (False, 4)), ("time", *_SIGNALS)),
+    (True, 9): ("time", *_SIDES, "angle", "angular_rate"),
+    (False, 6): (*_OLD, *_SIGNALS),
+    (False, 9): (*_OLD, *_SIDES),
+    (False, 10): (*_OLD, *_SIDES, "gyro"),
+}
+"""Names of the columns: of SysId, or of its forerunner; and by how many there are."""
+_UNITS = {
+    **{"rotations": "rev", "radians": "rad", "degrees": "deg"},
+    **{"meters": "m", "feet": "ft", "inches": "in"},
+}
 _DEEPEST = 16
 _WIDEST = 64
-_MOST_CELLS = 20_000_000
+_MOST_CELLS = 5_000_000
 
 
 def _open(path: Path, name: str, budget: Budget) -> ColumnFile:
@@ -40,14 +58,16 @@ def _open(path: Path, name: str, budget: Budget) -> ColumnFile:
     document, problem = _parsed(text, name, whole=path.suffix.lower() == ".json")
     units: dict[str, str] = {}
     dates: set[str] = set()
+    radius = 0.0
     if isinstance(document, Mapping) and any(test in document for test in _TESTS):
-        columns, units = _sysid(document, name)
+        columns, units, radius = _sysid(document, name)
     else:
         try:
-            columns = dict(_columns("", document, 0, dates))
+            columns = dict(islice(_columns("", document, 0, dates), round(WIDEST.value) + 1))
         except RecursionError:
             raise BagError(f"{name}: is nested too deeply") from None
-    return ColumnFile(path, name, columns, units, dates, [damaged(problem)] if problem else [])
+    problems = [damaged(problem)] if problem else []
+    return ColumnFile(path, name, columns, units, dates, problems, radius)
 
 
 def _parsed(text: str, name: str, *, whole: bool) -> tuple[Any, str]:
@@ -66,12 +86,19 @@ def _parsed(text: str, name: str, *, whole: bool) -> tuple[Any, str]:
 
 def _lines(text: str, name: str) -> tuple[list[Any], str]:
     """Return the objects of JSON lines; the last line may be cut off."""
+    lines = list(filter(None, map(str.strip, text.splitlines())))
+    try:
+        return json.loads(f"[{','.join(lines)}]"), ""
+    except ValueError:
+        pass  # not all of them are
     rows, bad = [], 0
-    for line in filter(None, map(str.strip, text.splitlines())):
+    for line in lines:
         try:
             rows.append(json.loads(line))
         except ValueError:
             bad += 1
+            if bad > 1 + STRAY_ROWS.value * len(lines):
+                break
     if not rows or bad > max(1, STRAY_ROWS.value * len(rows)):
         raise ValueError(f"{bad} of {bad + len(rows)} lines are no JSON")
     return rows, f"{name}: {bad} lines that are no JSON were left out" if bad else ""
@@ -99,6 +126,9 @@ def _columns(
                 column.append(cell)
     for key, column in cells.items():
         column.extend([None] * (len(value) - len(column)))
+        if {*map(type, column)} <= {int, float} and max(map(abs, column)) < 2**53:
+            yield key, np.array(column, np.float64)
+            continue
         try:
             values, _, timed = grid.columns(
                 [(cell,) for cell in column], [0], [key], key, range(1, len(column) + 1)
@@ -134,25 +164,39 @@ def _flat(prefix: str, row: Any, depth: int) -> Iterator[tuple[str, Any]]:
 
 def _sysid(
     document: Mapping[str, Any], name: str
-) -> tuple[dict[str, NDArray[Any]], dict[str, str]]:
-    """Return the columns of all tests, one behind another."""
+) -> tuple[dict[str, NDArray[Any]], dict[str, str], float]:
+    """Return the columns of all tests, one behind another, their units and the wheel's radius.
+
+    Where the file tells ``unitsPerRotation``, its rows are in rotations (in SysId always, in its
+    forerunner since April 2020), which that number makes ``units`` of; elsewhere they are in
+    ``units``.
+    """
     every = chain.from_iterable(document.get(test) or [] for test in _TESTS)
     rows = [row for row in every if isinstance(row, list) and len(row) >= 4]
     width = max(map(len, rows), default=0)
-    names = _SIMPLE if width == 4 else _DRIVE if document.get("sysid") else _OLD
+    form = _FORMS.get((bool(document.get("sysid")), width), ())
     try:
         table = np.array([row for row in rows if len(row) == width], np.float64)
-    except (TypeError, ValueError):
+        factor = float(document.get("unitsPerRotation") or 1.0)
+    except (TypeError, ValueError, OverflowError):
         raise BagError(f"{name}: its tests hold something else than rows of numbers") from None
-    if not table.size or width > len(names):
-        raise BagError(f"{name}: its tests hold no rows of {len(names)} numbers")
+    if not table.size or not form or not 0 < factor < np.inf:
+        widths = ", ".join(sorted({str(width) for _, width in _FORMS}))
+        raise BagError(f"{name}: its tests hold no rows of {widths} numbers, or no sound units")
     table = table[np.argsort(table[:, 0], kind="stable")]
-    turns = {"rotations": "rev", "radians": "rad", "degrees": "deg", "meters": "m", "feet": "ft"}
-    unit = turns.get(str(document.get("units", "")).lower(), "")
-    columns = {key: table[:, k] for k, key in enumerate(names[:width])}
-    ends = {"position": unit, "velocity": f"{unit}/s"} if unit else {}
-    units = {key: one for key in columns for end, one in ends.items() if key.endswith(end)}
-    return columns, units
+    columns = {key: table[:, k] for k, key in enumerate(form)}
+    if str(document.get("test", "Drivetrain")) in _ONE_MOTOR and "left_voltage" in columns:
+        columns = {k.removeprefix("left_"): c for k, c in columns.items() if "right" not in k}
+    unit = _UNITS.get(str(document.get("units", "")).lower(), "")
+    units = {}
+    for key in columns:
+        what = key.rpartition("_")[2]
+        if unit and what in ("position", "velocity"):
+            units[key] = unit if what == "position" else f"{unit}/s"
+            columns[key] = factor * columns[key]
+    rim = needs("position", unit, "wheel_radius")
+    metres = UNITS["position"][unit].factor if rim else 0.0
+    return columns, units, factor * metres / (2 * np.pi)
 
 
 def _reason(error: BaseException) -> str:

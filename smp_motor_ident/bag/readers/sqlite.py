@@ -18,6 +18,9 @@ from smp_motor_ident.errors import BagError
 
 MAGIC = b"SQLite format 3\0"
 _ROWS = 8192
+_ROW = 64  # bytes that a row takes at least, here and there
+_TABLES = ("topics", "messages", "message_definitions")
+_BEFORE = -(2**63)
 _BLOCK = 1 << 25
 
 
@@ -74,6 +77,10 @@ class _SqliteFile(Messages):
         columns = {row[1] for row in self._database.execute("PRAGMA table_info(topics)")}
         if not {"id", "name", "type"} <= columns:
             raise sqlite3.DatabaseError("it has no table of topics")
+        query = "SELECT name FROM sqlite_master WHERE type != 'table' AND sql IS NOT NULL"
+        views = [name for (name,) in self._database.execute(query) if str(name).lower() in _TABLES]
+        if views:  # which may have rows without end
+            raise sqlite3.DatabaseError(f"its {views[0]} are no table")
         definitions: dict[str, tuple[str, str]] = {}
         if self._database.execute("PRAGMA table_info(message_definitions)").fetchall():
             query = "SELECT topic_type, encoded_message_definition, encoding"
@@ -102,7 +109,7 @@ class _SqliteFile(Messages):
         asked = {channel.id: channel for channel in self._topics if wanted(channel)}
         if not asked:
             return
-        last = -(2**63)
+        last = _BEFORE
         try:
             if self._cut_off:
                 raise sqlite3.DatabaseError("cut off")
@@ -110,7 +117,8 @@ class _SqliteFile(Messages):
                 yield batches
         except sqlite3.DatabaseError as error:
             if not self._cut_off:
-                self._amiss(f"damaged behind message {last} ({error})")
+                where = "before its first message" if last == _BEFORE else f"behind message {last}"
+                self._amiss(f"damaged {where} ({error})")
             yield from self._salvaged(asked, last)
 
     def _reads(self, asked: dict[int, Channel]) -> Iterator[tuple[int, list[Batch]]]:
@@ -121,7 +129,7 @@ class _SqliteFile(Messages):
             "FROM (SELECT id, topic_id, timestamp, data FROM messages "
             f"WHERE id > ? {among}ORDER BY id LIMIT {_ROWS})"
         )
-        last = -(2**63)
+        last = _BEFORE
         while (read := self._in_bulk(source, last)) is not None:
             last, topic, batch = read
             yield last, self._by_topic(topic, batch, asked)
@@ -141,7 +149,7 @@ class _SqliteFile(Messages):
             size += len(row[3]) if isinstance(row[3], (bytes, str)) else 0
             if size > _BLOCK:
                 break
-        self._budget.take(size)
+        self._budget.take(size + _ROW * len(rows))
         return rows
 
     def _in_bulk(self, source: str, last: int) -> tuple[int, Integers, Batch] | None:
@@ -171,6 +179,7 @@ class _SqliteFile(Messages):
         table = np.frombuffer(times + b",", np.uint8).reshape(topic.size, digits).T
         if (table[-1] != ord(",")).any() or (table[:-1] < ord("0")).any():
             return None
+        self._budget.take(len(data) + _ROW * topic.size)
         log = np.zeros(topic.size, np.int64)
         for column in table[:-1]:
             log = log * 10 + (column - 48)

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from smp_motor_ident.bag.readers.format import Format, Tables
+from smp_motor_ident.bag.readers.format import Format, Tables, check_width
 from smp_motor_ident.bag.storage import TABLE, Channel, Table
 from smp_motor_ident.bag.unpack import Budget
 from smp_motor_ident.errors import BagError
@@ -76,6 +76,7 @@ class _Wpilog(Tables):
                 at += 4 + size
             if texts[1].removesuffix("[]") in _KINDS:
                 active[key] = self._entries.setdefault(texts[0], _Entry(texts[0], texts[1]))
+                check_width(len(self._entries), self.name, "entries")
 
     def channels(self) -> list[Channel]:
         """Return the entries of numbers."""

@@ -75,7 +75,7 @@ def test_a_file_of_which_the_reader_of_matlab_dies_is_refused(
     path.write_bytes(FUZZ.SEEDS["mat"][1]())
     reader = tmp_path / "reader.py"
     reader.write_text("import os; os.abort()")
-    monkeypatch.setattr("smp_motor_ident.bag.readers.mat._READER", reader)
+    monkeypatch.setattr("smp_motor_ident.bag.readers.apart.PROGRAM", reader)
     with pytest.raises(BagError, match=r"a\.mat: damaged MATLAB file"):
         read_records(path, FUZZ.COLUMNS)
 

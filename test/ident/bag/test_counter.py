@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from smp_motor_ident.bag import read_records
-from smp_motor_ident.bag.counter import is_full, unwrap, unwrap_angle
+from smp_motor_ident.bag.counter import Wrap, counts_of, is_full, unwrap, unwrap_angle
 from smp_motor_ident.errors import BagError
 
 
@@ -363,3 +363,26 @@ def test_an_angle_that_begins_anew_at_each_run_of_a_joined_log_begins_a_segment(
     assert record.starts == (0, 300, 600)
     assert [f.evidence for f in record.findings if f.code == "counter_reset"] == [{"times": 2}]
     np.testing.assert_allclose(record.position[300:600], np.deg2rad(run), atol=1e-9)
+
+
+@pytest.mark.parametrize("offset", [2**53, 2**60, 2**62 + 12_345, -(2**63) + 10**6])
+def test_counts_far_from_zero_keep_every_step(tmp_path: Path, offset: int) -> None:
+    true = turning()
+    rows = (f"{0.01 * k:.2f},{k % 5},{n + offset}" for k, n in enumerate(true.tolist()))
+    (tmp_path / "log.csv").write_text("\n".join(["t,u,c", *rows]))
+    mapping = ["voltage=u count=c time=t counts_per_revolution=2000"]
+    record = read_records(tmp_path / "log.csv", mapping)["motor"]
+    assert np.array_equal(record.count - record.count[0], true - true[0])
+
+
+def test_counts_that_no_encoder_makes_are_refused(tmp_path: Path) -> None:
+    rows = (f"{0.01 * k:.2f},8,{k**2 * 10**14}" for k in range(300))
+    (tmp_path / "log.csv").write_text("\n".join(["t,u,c", *rows]))
+    with pytest.raises(BagError, match="the count moves by"):
+        read_records(tmp_path / "log.csv", ["voltage=u count=c time=t counts_per_revolution=2000"])
+
+
+def test_the_roundest_width_is_found_at_once_however_many_are_admitted() -> None:
+    assert counts_of(Wrap(3.1e17, 1e16, 5), 10**9) == 2**58
+    assert counts_of(Wrap(2.0e17 - 100, 1e14, 5), 10**9) % 1000 == 0
+    assert counts_of(Wrap(1999.8, 0.1, 5), 1990) == 2000

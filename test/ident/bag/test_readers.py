@@ -197,32 +197,56 @@ def test_of_a_data_log_that_is_cut_off_the_rest_is_read(tmp_path: Path) -> None:
     assert [f.code for f in record.findings if f.severity == "warning"] == ["damaged_recording"]
 
 
-def test_a_sysid_file_describes_itself(tmp_path: Path) -> None:
-    rows = np.stack([TIME, VOLTAGE, np.zeros(N), SPEED], axis=1)
-    document = {
-        "sysid": True,
-        "test": "Simple",
-        "units": "Rotations",
-        "unitsPerRotation": 1.0,
-        "slow-forward": rows[:100].tolist(),
-        "fast-backward": np.add(rows[100:], (10.0, 0, 0, 0)).tolist(),
-    }
+TESTS = ("slow-forward", "slow-backward", "fast-forward", "fast-backward")
+
+
+def sysid(path: Path, columns: list[np.ndarray], **keys: object) -> Path:
+    """Write rows as the documentation of SysId has them, a quarter of them in each test."""
+    rows = np.array_split(np.stack(columns, axis=1), 4)
+    tests = {test: some.tolist() for test, some in zip(TESTS, rows)}
+    path.write_text(json.dumps({"sysid": True, "test": "Simple", **tests, **keys}))
+    return path
+
+
+TURNS = np.cumsum(SPEED) * np.diff(TIME, prepend=0) / (2 * np.pi)  # of the output
+RATE = SPEED / (2 * np.pi)  # rotations a second
+
+
+@pytest.mark.parametrize(
+    ("units", "per_rotation", "mapping"),
+    [
+        ("Rotations", 1.0, None),
+        ("Radians", 2 * np.pi, None),
+        ("Degrees", 360.0, None),
+        ("Meters", 2 * np.pi * 0.076, ["wheel_radius=0.076"]),
+        ("Feet", 2 * np.pi * 0.076 / 0.3048, ["wheel_radius=0.076"]),
+        ("Inches", 2 * np.pi * 0.076 / 0.0254, ["wheel_radius=0.076"]),
+    ],
+)
+def test_rotations_of_sysid_are_converted_by_its_units_per_rotation(
+    tmp_path: Path, units: str, per_rotation: float, mapping: list[str] | None
+) -> None:
+    # docs/data-collection.md: "all positions and velocities should be in rotations"
     path = tmp_path / "sysid.json"
-    path.write_text(json.dumps(document))
-    record = read_records(path)["motor"]
-    np.testing.assert_allclose(record.velocity, 2 * np.pi * SPEED)  # a rotation is two pi
-    assert record.starts == (0, 100)
+    sysid(path, [TIME, VOLTAGE, TURNS, RATE], units=units, unitsPerRotation=per_rotation)
+    record = read_records(path, mapping)["motor"]
+    np.testing.assert_allclose(record.velocity, SPEED, rtol=1e-12)
+    np.testing.assert_allclose(record.position, 2 * np.pi * TURNS, atol=1e-9)
+
+
+def test_each_test_of_sysid_is_a_segment(tmp_path: Path) -> None:
+    time = TIME + 10.0 * np.repeat(np.arange(4), N // 4)
+    path = tmp_path / "sysid.json"
+    sysid(path, [time, VOLTAGE, TURNS, RATE], units="Rotations", unitsPerRotation=1.0)
+    assert read_records(path)["motor"].starts == tuple(range(0, N, N // 4))
 
 
 def drivetrain(path: Path) -> Path:
-    """Write a SysId file of a drivetrain in metres, whose left wheel has a radius of 50 mm."""
-    way = np.cumsum(SPEED) * np.diff(TIME, prepend=0)
-    left, right = (VOLTAGE, 0.05 * way, 0.05 * SPEED), (-VOLTAGE, -0.05 * way, -0.05 * SPEED)
-    sides = [column for both in zip(left, right) for column in both]
-    rows = np.stack([TIME, *sides, np.zeros(N), np.zeros(N)], axis=1)
-    document = {"sysid": True, "test": "Drivetrain", "units": "Meters", "unitsPerRotation": 0.3142}
-    path.write_text(json.dumps(document | {"slow-forward": rows.tolist()}))
-    return path
+    """Write a SysId file of a drivetrain whose wheels have a radius of 50 mm."""
+    sides = [VOLTAGE, -VOLTAGE, TURNS, -TURNS, RATE, -RATE]
+    columns = [TIME, *sides, np.zeros(N), np.zeros(N)]
+    keys = {"test": "Drivetrain", "units": "Meters", "unitsPerRotation": 2 * np.pi * 0.05}
+    return sysid(path, columns, **keys)
 
 
 def test_a_sysid_drivetrain_in_metres_needs_the_wheels_radius_only(tmp_path: Path) -> None:
@@ -246,6 +270,29 @@ def test_what_is_suggested_for_a_drivetrain_in_metres_asks_for_the_radius(tmp_pa
     assert listing.remark == "the file says this itself: wheel_radius alone is enough"
     records = read_records(path, [*listing.suggestion, "wheel_radius=0.05"])
     np.testing.assert_allclose(records["left"].velocity, SPEED, atol=1e-9)
+
+
+@pytest.mark.parametrize("keys", [{}, {"units": "Radians"}])
+def test_rows_of_its_forerunner_have_six_columns(tmp_path: Path, keys: dict[str, object]) -> None:
+    # frc-characterization, arm-characterization/data_analyzer.py of 2019: ``columns``
+    path = tmp_path / "arm.json"
+    battery, speed = np.full(N, 12.5), VOLTAGE / 12.5
+    sysid(path, [TIME, battery, speed, VOLTAGE, TURNS, SPEED], sysid=False, test="Arm", **keys)
+    mapping = None if keys else ["voltage=voltage velocity=velocity time=time"]
+    record = read_records(path, mapping)["motor"]
+    np.testing.assert_allclose(record.velocity, SPEED)
+    np.testing.assert_allclose(record.voltage[1:], VOLTAGE[:-1])
+
+
+def test_a_mechanism_of_its_forerunner_is_in_the_left_columns(tmp_path: Path) -> None:
+    # frc-characterization, Robot.java.mako since April 2020: ten columns in rotations
+    path = tmp_path / "simple.json"
+    zero = np.zeros(N)
+    columns = [TIME, zero, zero, VOLTAGE, VOLTAGE, TURNS, TURNS, RATE, RATE, zero]
+    sysid(path, columns, sysid=False, test="Simple", units="Degrees", unitsPerRotation=360.0)
+    records = read_records(path)
+    assert list(records) == ["motor"]
+    np.testing.assert_allclose(records["motor"].velocity, SPEED, rtol=1e-12)
 
 
 @pytest.mark.parametrize("form", ["rows", "columns", "lines", "nested"])

@@ -371,3 +371,34 @@ def test_a_recording_knows_when_it_began_where_its_clock_was_set(
     early = replaced(truth, time=truth.time - corpus.START)
     (record,) = read_records(corpus.write_mcap(tmp_path / "b.mcap", early.messages())).values()
     assert record.recorded is None
+
+
+@pytest.mark.parametrize("years", [0.01, 1.0, 56.0])
+def test_a_clock_that_is_set_forward_begins_a_segment_and_costs_no_time(
+    tmp_path: Path, corpus: SimpleNamespace, years: float
+) -> None:
+    truth = corpus.motion(n=400)
+    leap = round(years * 365.25 * 86_400) * 10**9
+    time = truth.time - corpus.START
+    truth = replaced(truth, time=time + leap * (np.arange(400) >= 250) + 10**9)
+    record = corpus.read(tmp_path / "bag.mcap", truth.messages())
+    assert record.starts == (0, 250)
+    assert record.duration < 20.0
+    np.testing.assert_allclose(np.diff(record.time)[[248, 250]], 0.01, rtol=1e-9)
+    found = next(f for f in record.findings if f.code == "clock_set")
+    assert found.evidence["longest"] == pytest.approx(leap * 1e-9, rel=1e-6)
+
+
+def test_all_topics_keep_what_they_are_apart_where_the_clock_is_set(
+    tmp_path: Path, corpus: SimpleNamespace
+) -> None:
+    number, leap = "std_msgs/msg/Float64", 10**18
+    sent = [
+        corpus.Sent(topic, number, at, corpus.serialized(number, data=float(value)))
+        for k in range(400)
+        for at in [corpus.START + 10**7 * k + leap * (k >= 200)]
+        for topic, value in (("/u", k // 20 % 3), ("/w", np.sin(0.1 * k)))
+    ]
+    record = corpus.read(tmp_path / "bag.mcap", sent, ["voltage=/u.data velocity=/w.data"])
+    assert record.starts == (0, 200)
+    np.testing.assert_allclose(record.velocity, np.sin(0.1 * np.arange(400)))

@@ -1,1 +1,38 @@
-"""Programs that read what may kill a reader, each in a process of its own."""
+"""Formats whose libraries may take any memory or time, or die: a process of its own reads each."""
+
+import io
+import json
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+from smp_motor_ident.bag.unpack import Budget
+from smp_motor_ident.errors import BagError
+
+PROGRAM = Path(__file__).parent / "program.py"
+PATIENCE, PER_BYTE = 15.0, 1e-6
+"""How long a file may take to be read [s], and for each of its bytes."""
+
+
+def read(kind: str, path: Path, name: str, budget: Budget) -> tuple[dict[str, Any], io.BytesIO]:
+    """Return what the program says of a file, and its data."""
+    command = [sys.executable, str(PROGRAM), kind, str(path), str(budget.left)]
+    patience = PATIENCE + PER_BYTE * path.stat().st_size
+    try:
+        done = subprocess.run(command, capture_output=True, check=False, timeout=patience)
+    except subprocess.TimeoutExpired:
+        raise BagError(
+            f"{name}: is not read after {patience:.0f} s, which its size does not explain; save "
+            "its columns as CSV"
+        ) from None
+    if done.returncode:
+        raise BagError(f"{name}: damaged {kind} file (its reader ends with {done.returncode})")
+    answer = io.BytesIO(done.stdout)
+    head = json.loads(answer.readline())
+    if head["too_large"]:
+        budget.take(budget.left + 1)
+    budget.take(len(done.stdout))
+    if head["error"]:
+        raise BagError(f"{name}: {head['error']}")
+    return head, answer

@@ -1,6 +1,7 @@
-"""Reads a MATLAB file from standard input; the argument is how much memory it may take [byte].
+"""Reads a file by a library of others; arguments: ``MATLAB`` or ``Excel``, path, memory [byte].
 
-Writes a line of JSON (``error``, ``too_large``, ``objects``, ``columns``), then the columns.
+Writes a line of JSON (``error``, ``too_large``, ``objects``, ``columns``, ``sheets``): names of the
+columns, which follow as arrays, or how many rows each sheet has, which follow as lines of JSON.
 """
 
 import io
@@ -9,7 +10,8 @@ import resource
 import struct
 import sys
 import warnings
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
+from datetime import timedelta
 from pathlib import Path
 from typing import Any, cast
 
@@ -18,8 +20,10 @@ import numpy as np
 _HEAD = 128  # bytes of a file of version 5 before its first variable
 _DEEPEST = 16
 _WIDEST = 64  # columns of a matrix that are taken as signals; a wider one is something else
+_MOST_VALUES = 100_000  # of structures and cells that are looked at
+_MOST_ROWS = 1_048_576  # of a sheet, by Excel's own limits
 _UNBOUND = resource.getrlimit(resource.RLIMIT_AS)[1]
-_SLACK = 1 << 26  # memory that readers need beside what they read [byte]
+_SLACK = 1 << 26  # memory that readers need in addition to what they read [byte]
 
 
 class Unreadable(Exception):
@@ -27,30 +31,91 @@ class Unreadable(Exception):
 
 
 def main() -> None:
-    """Read a file from standard input and write what is in it: JSON in a line, then columns."""
-    data = sys.stdin.buffer.read()
-    head: dict[str, Any] = {"error": "", "too_large": False, "objects": [], "columns": []}
-    columns: dict[str, np.ndarray[Any, Any]] = {}
+    """Read a file and write what is in it."""
+    kind, path, memory = sys.argv[1], Path(sys.argv[2]), int(sys.argv[3])
+    head: dict[str, Any] = {"error": "", "too_large": False, "objects": []}
+    parts: list[bytes] = []
+    left = memory
     try:
-        for content in _contents(data, head["objects"]):
-            columns |= _columns("", content, 0, head["objects"])
+        read = _workbook(path, memory) if kind == "Excel" else _variables_of(path, memory, head)
+        for name, part in read:
+            head.setdefault(name[0], []).append(name[1])
+            parts.append(part)
+            left -= len(part)
+            if left < 0:
+                raise MemoryError
     except Unreadable as error:
         head["error"] = str(error)
     except MemoryError:
-        head["too_large"] = True
-    except Exception as error:  # readers raise whatever their bytes lead them to
+        head["too_large"], parts = True, []
+    except Exception as error:  # libraries raise whatever their bytes lead them to
         reason = (str(error).splitlines() or [type(error).__name__])[0]
-        head["error"] = f"no readable MATLAB file ({reason[:200]})"
-    resource.setrlimit(resource.RLIMIT_AS, (_UNBOUND, _UNBOUND))  # the answer is a copy
-    head["columns"] = list(columns)
+        head["error"] = f"no readable {kind} file ({reason[:200]})"
+    resource.setrlimit(resource.RLIMIT_AS, (_UNBOUND, _UNBOUND))
     sys.stdout.buffer.write(json.dumps(head).encode() + b"\n")
-    for values in columns.values():
-        answer = io.BytesIO()
-        np.save(answer, values, allow_pickle=False)
-        sys.stdout.buffer.write(answer.getbuffer())
+    sys.stdout.buffer.writelines(parts)
 
 
-def _contents(data: bytes, objects: list[str]) -> Iterator[dict[str, Any]]:
+Part = tuple[tuple[str, Any], bytes]
+"""What the head says of a part, and its bytes."""
+
+
+def _variables_of(path: Path, memory: int, head: dict[str, Any]) -> Iterator[Part]:
+    """Yield the vectors of a MATLAB file."""
+    for content in _contents(path.read_bytes(), head["objects"], memory):
+        for name, values in _columns("", content, 0, head["objects"]):
+            answer = io.BytesIO()
+            np.save(answer, values, allow_pickle=False)
+            yield ("columns", name), answer.getvalue()
+
+
+def _workbook(path: Path, memory: int) -> Iterator[Part]:
+    """Yield the sheets of a workbook: their rows with cells, as they are shown."""
+    try:
+        import openpyxl
+    except ImportError:
+        raise Unreadable(
+            "is an Excel workbook, which needs openpyxl (pip install openpyxl); or save it as CSV"
+        ) from None
+    _bound_memory(memory)
+    warnings.simplefilter("ignore")
+    book = openpyxl.load_workbook(path, read_only=True, data_only=True)
+    left = memory
+    for sheet in book.worksheets:
+        if not hasattr(sheet, "reset_dimensions"):  # a chart
+            continue
+        sheet.reset_dimensions()  # what a file says of its width is not what it holds
+        lines = []
+        for k, row in enumerate(sheet.iter_rows()):
+            if k >= _MOST_ROWS:
+                raise Unreadable(f"says that it has more than the {_MOST_ROWS:,} rows of a sheet")
+            if row and (cells := _cells(row)):
+                lines.append(json.dumps(cells).encode() + b"\n")
+                left -= len(lines[-1])
+                if left < 0:
+                    raise MemoryError
+        yield ("sheets", len(lines)), b"".join(lines)
+
+
+def _cells(row: Iterable[Any]) -> list[Any]:
+    """Return the values of a row as text shows them, up to the last; empty where there is none."""
+    cells, filled = [], 0
+    for k, cell in enumerate(row, 1):
+        value = cell.value
+        if value is not None:
+            filled = k
+            if isinstance(value, timedelta):
+                minutes, seconds = divmod(value.total_seconds(), 60)
+                value = f"{int(minutes // 60)}:{int(minutes % 60):02}:{seconds:09.6f}"
+            elif hasattr(value, "isoformat"):
+                value = value.isoformat()
+            elif isinstance(value, (int, float)) and "%" in (cell.number_format or ""):
+                value = f"{100 * value:.15g}%"
+        cells.append(value)
+    return cells[:filled]
+
+
+def _contents(data: bytes, objects: list[str], memory: int) -> Iterator[dict[str, Any]]:
     """Yield the variables of a file by their names, as its version's library gives them.
 
     Note the objects of version 7.3.
@@ -63,7 +128,7 @@ def _contents(data: bytes, objects: list[str]) -> Iterator[dict[str, Any]]:
                 "is a MATLAB file of version 7.3, which needs h5py (pip install h5py); "
                 "or save it in MATLAB with -v7"
             ) from None
-        _bound_memory()
+        _bound_memory(memory)
         taken: dict[str, Any] = {}
 
         def take(key: str, item: Any) -> None:
@@ -80,7 +145,7 @@ def _contents(data: bytes, objects: list[str]) -> Iterator[dict[str, Any]]:
         return
     from scipy.io import loadmat  # takes a while to load, for one of many formats
 
-    _bound_memory()
+    _bound_memory(memory)
     for part in _variables(data) if data.startswith(b"MATLAB 5.0 MAT") else [data]:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # of objects, which have no names there
@@ -90,10 +155,10 @@ def _contents(data: bytes, objects: list[str]) -> Iterator[dict[str, Any]]:
         yield {key: value for key, value in whole.items() if not key.startswith("__")}
 
 
-def _bound_memory() -> None:
-    """Let this process take no more than it was given, beside what it has."""
+def _bound_memory(memory: int) -> None:
+    """Let this process take no more than so much in addition to what it has."""
     pages = int(Path("/proc/self/statm").read_text().split()[0])
-    limit = pages * resource.getpagesize() + int(sys.argv[1]) + _SLACK
+    limit = pages * resource.getpagesize() + memory + _SLACK
     resource.setrlimit(resource.RLIMIT_AS, (limit, _UNBOUND))
 
 
