@@ -12,6 +12,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+from smp_motor_control.errors import is_ros_name
 from smp_motor_control.parameter_file import read_yaml
 from smp_motor_ident.bag.template import parse_path
 from smp_motor_ident.bag.units import check_unit
@@ -33,13 +34,15 @@ DEFAULT_MOTOR = "motor"  # name of the motor where a mapping has only one and do
 _NUMBER = r"(?:\d+\.?\d*(?:[eE][+-]?\d+)?|\.\d+(?:[eE][+-]?\d+)?)"
 _PRODUCT = rf"{_NUMBER}(?:\s*[*/]\s*{_NUMBER})*"
 _SPEC = re.compile(
-    rf"""(?P<source>"[^"]*"|.+?)
+    rf"""(?P<source>"(?:[^"]|"")*"|.+?)
     (?P<scale>(?:\s*[*/]\s*-?{_NUMBER})*)
     (?P<offset>(?:\s*[+-]\s*{_PRODUCT})?)
     (?:\s*:\s*(?P<unit>[A-Za-zµ°%]+(?:/[a-z]+)?))?
     (?:\s*@\s*(?P<shaft>\w+))?\s*""",
     re.VERBOSE,
 )
+_BETWEEN = re.compile(r"""\s+(?=[\w./]+=[^=])(?=(?:[^"]*"[^"]*")*[^"]*$)""")
+"""Blanks that stand before another ``KEY=``, but for those in quotes."""
 _TOPIC = re.compile(r"(?P<topic>/[\w/-]+)\.(?P<field>.+)")
 
 
@@ -112,8 +115,7 @@ def parse(items: Iterable[str], msg_files: Iterable[str] = ()) -> SignalMap:
         items = [items]
     document: dict[str, Any] = {}
     motors: dict[str, dict[str, Any]] = {}
-    # ``a=b c=d`` is split at the blanks that stand before another ``KEY=``.
-    parts = (part for whole in items for part in re.split(r"\s+(?=[\w.]+=[^=])", whole.strip()))
+    parts = (part for whole in items for part in _BETWEEN.split(whole.strip()))
     for item in filter(None, parts):
         key, equals, value = item.partition("=")
         if not equals or not value.strip():
@@ -156,6 +158,11 @@ def from_document(document: Any, where: str = "mapping") -> SignalMap:
             raise BagError(f"{where}: {signals[0]} needs its wheel: WHEEL.{signals[0]}=...")
         motors = {DEFAULT_MOTOR: {n: rest.pop(n) for n in (*signals, "time") if n in rest}}
     defaults = _motor(rest, where)
+    for wheel in map(str, motors):
+        if not is_ros_name(wheel):
+            raise BagError(
+                f"{where}: {wheel!r} is no ROS name; use letters, digits and _ as left_1"
+            )
     each = {str(w): _motor(entry, f"{where}: {w}", defaults) for w, entry in motors.items()}
     return SignalMap(each, defaults, tuple(types))
 
@@ -269,6 +276,7 @@ def _written(text: str, place: str) -> Signal:
     source = match["source"].strip()
     scale = _times(1.0, match["scale"], f"{place}: {text!r}")
     offset = _number(match["offset"].replace(" ", "") or "0", place)
-    named = _TOPIC.fullmatch(source)  # anything else is a column of a CSV file
-    topic, path = (named["topic"], named["field"].strip()) if named else ("", source.strip('"'))
+    named = _TOPIC.fullmatch(source)  # anything else is a column, or in quotes
+    path = source[1:-1].replace('""', '"') if source.startswith('"') else source
+    topic, path = (named["topic"], named["field"].strip()) if named else ("", path)
     return Signal(topic, path, scale, offset, match["unit"] or "", match["shaft"] or "")

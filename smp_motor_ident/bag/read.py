@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from smp_motor_control.errors import is_ros_name
 from smp_motor_ident.bag import mapping as mappings
 from smp_motor_ident.bag.assemble import assemble
 from smp_motor_ident.bag.decode import collect
@@ -220,6 +221,10 @@ def _plans(recording: Recording, asked: SignalMap, channels: list[Channel]) -> d
         names = {topic: topic.rpartition("/")[0][1:] or topic[1:] for topic in states}
     plans = {}
     for topic, wheel in names.items():
+        if not is_ros_name(wheel):
+            raise BagError(
+                f"{recording.name}: {topic!r} is no ROS name, so that its wheel has none"
+            )
         signals = {name: Signal(topic, path) for name, path in OWN_FIELDS.items()}
         given = asked.motors.get(wheel, asked.defaults)
         plans[wheel] = replace(

@@ -3,6 +3,7 @@
 import argparse
 import gc
 import importlib
+import io
 import os
 import shlex
 import sys
@@ -65,7 +66,10 @@ class _Output:
 def run(made: Callable[[], Parser], work: Work | str, argv: Sequence[str] | None = None) -> int:
     """Parse, do the work, and turn whatever happens into a line and an exit code."""
     parser, before = made(), sys.stdout
-    sys.stdout = _Output(before or open(os.devnull, "w"))  # noqa: SIM115  (closed by the shell: None)
+    stream = before or open(os.devnull, "w")  # noqa: SIM115  (closed by the shell: None)
+    if isinstance(stream, io.TextIOWrapper):
+        stream.reconfigure(errors="backslashreplace")  # of a path that is no UTF-8
+    sys.stdout = _Output(stream)
     try:
         given = sys.argv[1:] if argv is None else argv
         own, ros = split_arguments(given)

@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence, Sized
 from pathlib import Path
 from typing import Any
 
+from smp_motor_control.errors import printable
 from smp_motor_control.motor.file import load_motors
 from smp_motor_control.motor.parameters import COMBINATIONS
 from smp_motor_control.parameter_file import flat
@@ -143,7 +144,8 @@ def _write(
     heading = provenance(wheels, arguments, estimates, date)
     heading += [line for lines in reasons.values() for line in lines]
     sources = sorted({s for e in estimates.values() for s in e.sources})
-    origin = {"date": date, "input": str(arguments.source), "sources": sources, **reasons}
+    source = printable(str(arguments.source))
+    origin = {"date": date, "input": source, "sources": sources, **reasons}
     text = gains_yaml(wheels.designs, heading)
     document = to_json(gains_document(wheels.designs, origin, wheels.reason))
     drawn = {w: curves(estimates[w], one) for w, one in wheels.designs.items()}

@@ -6,18 +6,22 @@ import shutil
 import tempfile
 from collections.abc import Iterable, Mapping
 from datetime import datetime, timezone
+from itertools import chain, pairwise
 from pathlib import Path
 from typing import Any
 
 import msgspec
 import numpy as np
 
+from smp_motor_control.errors import is_ros_name, printable
 from smp_motor_control.motor.parameters import COMBINATIONS, PHYSICAL
 from smp_motor_control.parameter_file import written
 from smp_motor_ident.errors import BagError, ParameterError
 from smp_motor_ident.result import Estimate, Quantity
 
 SCHEMA = 1
+LARGEST = 1e12
+"""No number of a motor is larger in SI units; squares of larger ones leave the floats."""
 POSITIVE = ("resistance", "inductance", "motor_constant", "inertia", "dc_gain")
 
 
@@ -36,8 +40,10 @@ def read_identification(path: Path) -> dict[str, Estimate]:
     """Read ``identification.json``."""
     if path.is_dir():
         path = path / "identification.json"
+    if path.exists() and not path.is_file():
+        raise BagError(f"{path}: is not a file; give a file that identify wrote")
     try:
-        document = msgspec.json.decode(path.read_bytes())
+        document = _clean(msgspec.json.decode(path.read_bytes()))
     except OSError as error:
         raise BagError(f"{path}: cannot be read ({error.strerror})") from None
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
@@ -47,7 +53,23 @@ def read_identification(path: Path) -> dict[str, Estimate]:
     motors = document.get("motors")
     if not isinstance(motors, dict) or not motors:
         raise BagError(f"{path}: is damaged (it holds no motors); run identify again")
+    for wheel in motors:
+        if not is_ros_name(wheel):
+            raise BagError(
+                f"{path}: the wheel {wheel!r} has no ROS name; rename it: letters, digits, _"
+            )
     return {wheel: _motor(wheel, entry, path) for wheel, entry in motors.items()}
+
+
+def _clean(value: Any) -> Any:
+    """Return what a document holds with its texts in one line."""
+    if isinstance(value, str):
+        return printable(value)
+    if isinstance(value, list):
+        return [_clean(inner) for inner in value]
+    if isinstance(value, dict):
+        return {key: _clean(inner) for key, inner in value.items()}
+    return value
 
 
 def _motor(wheel: str, entry: Any, path: Path) -> Estimate:
@@ -56,7 +78,8 @@ def _motor(wheel: str, entry: Any, path: Path) -> Estimate:
         given = {k: v for k, v in msgspec.convert(entry, dict[str, Any]).items() if v is not None}
         given["wheel"] = wheel
         covariance = msgspec.convert(given.pop("covariance", {}), dict[str, Any])
-        given |= {"names": covariance.get("names", []), "covariance": covariance.get("matrix", [])}
+        if covariance.get("names"):
+            given |= {"names": covariance["names"], "covariance": covariance.get("matrix", [])}
         for group in (given.get("parameters", {}), given.get("combinations", {})):
             for quantity in msgspec.convert(group, dict[str, dict[str, Any]]).values():
                 quantity["ci95"] = _interval(quantity.get("ci95"))
@@ -81,12 +104,23 @@ def _matrix(kind: Any, value: Any) -> Any:
 def _check(estimate: Estimate) -> None:
     """Refuse what has the right types and is impossible all the same."""
     size = len(estimate.names)
-    shape = estimate.covariance.shape if size else (0, 0)
-    if shape != (size, size) or len(set(estimate.names)) != size:
+    if estimate.covariance.shape != (size, size) or len(set(estimate.names)) != size:
         raise ValueError(f"the covariance is not one of its {size} names")
+    if error := estimate.residuals.model_error:
+        lengths = {len(error.frequency), len(error.shown), len(error.bound)}
+        if len(lengths) > 1:
+            raise ValueError(f"residuals.model_error has lists of {sorted(lengths)} numbers")
+        rising = (0.0, *error.frequency)
+        if not all(a < b for a, b in pairwise(rising)) or min(error.bound, default=1.0) < 0:
+            raise ValueError("residuals.model_error: frequencies must rise, bounds be positive")
     if size and (np.diag(estimate.covariance) < 0).any():
         raise ValueError("a variance is negative")
+    for name, number in chain.from_iterable(one.items() for one in estimate.alternatives):
+        if abs(number) > LARGEST:
+            raise ValueError(f"an alternative's {name} is {number:g}; no motor has that")
     for name, quantity in (*estimate.parameters.items(), *estimate.combinations.items()):
+        if abs(quantity.value or 0.0) > LARGEST:
+            raise ValueError(f"{name} is {quantity.value:g}; no motor has that")
         if quantity.value is None and quantity.status != "unidentifiable":
             raise ValueError(f"{name}: it is {quantity.status} and has no value")
         if name in POSITIVE and quantity.value is not None and quantity.value <= 0:
@@ -161,7 +195,8 @@ def write_together(files: Mapping[Path, str | bytes], force: bool = False) -> No
 def _exchange(drafts: Mapping[Path, tuple[Path, str | bytes]]) -> None:
     """Write the drafts in full, then rename them into place; undo the renames on failure."""
     for draft, (_, body) in drafts.items():
-        draft.write_bytes(body.encode() if isinstance(body, str) else body)
+        # Of a path that is no UTF-8 a text may hold what no text can
+        draft.write_bytes(body.encode("utf-8", "replace") if isinstance(body, str) else body)
     done: list[tuple[Path, Path | None]] = []
     try:
         for draft, (path, _) in drafts.items():

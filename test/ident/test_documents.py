@@ -85,6 +85,47 @@ def test_whatever_stands_anywhere_in_a_document_it_is_read_or_refused_in_a_line(
         assert "\n" not in said
 
 
+@pytest.mark.parametrize("name", ['a*/\nsystem("x"); //', "a b", "1a", "", "a/", "ä", "../a"])
+def test_a_wheel_that_has_no_ros_name_is_refused(tmp_path: Path, name: str) -> None:
+    path = tmp_path / "identification.json"
+    path.write_text(json.dumps(identification_document({name: estimate()})))
+    with pytest.raises(BagError, match="has no ROS name"):
+        read_identification(path)
+
+
+def test_texts_of_a_document_stay_in_their_lines(tmp_path: Path) -> None:
+    document = identification_document({"w": estimate()})
+    document["motors"]["w"]["sources"] = ["bag\n#define K_P 0\x1b[2J"]
+    (tmp_path / "identification.json").write_text(json.dumps(document))
+    assert read_identification(tmp_path)["w"].sources == ("bag\ufffd#define K_P 0\ufffd[2J",)
+
+
+@pytest.mark.parametrize("name", ["frequency", "shown", "bound"])
+def test_lists_of_unequal_length_are_refused(tmp_path: Path, name: str) -> None:
+    error = {"frequency": [1.0, 2.0], "shown": [0.1, 0.1], "bound": [0.2, 0.2]}
+    document = identification_document({"w": estimate()})
+    document["motors"]["w"]["residuals"]["model_error"] = {**error, name: [1.0]}
+    (tmp_path / "identification.json").write_text(json.dumps(document))
+    with pytest.raises(BagError, match="model_error has lists of"):
+        read_identification(tmp_path)
+
+
+def test_what_is_no_file_is_not_waited_for(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "identification.json")
+    with pytest.raises(BagError, match="is not a file"):
+        read_identification(tmp_path)
+    with pytest.raises(ParameterError, match="is not a file"):
+        read_parameters(tmp_path / "identification.json")
+
+
+def test_aliases_count_whole_before_a_parameter_file_is_built(tmp_path: Path) -> None:
+    inner = (",".join([f"*a{k - 1}" if k else "1"] * 10) for k in range(9))
+    text = "".join(f"a{k}: &a{k} [{one}]\n" for k, one in enumerate(inner))
+    (tmp_path / "a.yaml").write_text(text)
+    with pytest.raises(ParameterError, match="more than 100,000 values"):
+        read_parameters(tmp_path / "a.yaml")
+
+
 @pytest.mark.parametrize("text", ["[" * 100_000, '{"schema": 1, "motors": ' + '{"a":' * 100_000])
 def test_a_document_nested_without_end_is_refused(tmp_path: Path, text: str) -> None:
     (tmp_path / "identification.json").write_text(text)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import json
 import math
 import sys
 from dataclasses import replace
@@ -11,8 +12,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
+from results import estimate
 
 from smp_motor_ident.cli.tune import main
+from smp_motor_ident.report.document import identification_document
 from smp_motor_ident.tune.exports import FORMATS
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -102,3 +105,18 @@ def test_a_wheel_blocked_at_full_speed_does_not_overflow_16_bits(bench):
     numbers = target.convert(one).numbers
     fastest = bench.SUPPLY / bench.combinations(bench.TABLE_1["front_left"])[0]
     assert 0 < numbers["Kd"] * fastest * 4000 / (2 * math.pi) * 0.033 <= 32767
+
+
+@pytest.mark.parametrize("name", FORMATS)
+def test_no_text_of_an_identification_leaves_its_comment(tmp_path, capsys, name):
+    hostile = "a\\\n#define EVIL 1"
+    finding = {"code": "x", "severity": "warning", "message": hostile, "evidence": {}, "advice": ""}
+    document = identification_document({"robot1/left": estimate()})
+    document["motors"]["robot1/left"] |= {"findings": [finding], "sources": [hostile]}
+    (tmp_path / "identification.json").write_text(json.dumps(document))
+    given = ["--supply", "12", "--counts-per-revolution", "500", "--accept-unreliable"]
+    assert main([str(tmp_path), "--export", name, *given]) == 0
+    text = capsys.readouterr().out
+    assert not [line for line in text.splitlines() if line.startswith("#define EVIL")]
+    assert not [line for line in text.splitlines() if line.endswith("\\")]
+    assert "robot1/left_pid" not in text  # no name of C

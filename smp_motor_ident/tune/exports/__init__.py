@@ -4,6 +4,7 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
+from smp_motor_control.errors import printable
 from smp_motor_ident.result import Estimate
 from smp_motor_ident.tune.exports import (
     arduino_pid,
@@ -51,7 +52,8 @@ def export(
             f"largest speed {_settles(one)}, overshoot {step.overshoot:.2g} %"
         )
         head.extend(f"  {words}" for words in wheels.designs[wheel].warnings)
-    text = "".join(f"{mark} {line}\n" for line in head)
+    # A backslash at its end would make the next line a comment, too
+    text = "".join(f"{mark} {printable(line).replace(chr(92), '/')}\n" for line in head)
     return text + target.render(wheels.designs, gains), checks
 
 

@@ -51,7 +51,7 @@ def _start(setting: Setting) -> Step:
 def _render(designs: Mapping[str, Design], gains: Mapping[str, Gains]) -> str:
     lines = []
     for wheel, one in gains.items():
-        n = one.numbers
+        n, wheel = one.numbers, wheel.replace("/", "_")
         lines += [
             f"// {wheel}: input and set-point in rad/s of the wheel, output in PWM",
             f"PID {wheel}_pid(&{wheel}_speed, &{wheel}_pwm, &{wheel}_target, "

@@ -29,6 +29,8 @@ from smp_motor_ident.errors import BagError
         ("velocity=Motor_Speed(RPM):rpm", Signal("", "Motor_Speed(RPM)", 1.0, 0.0, "rpm")),
         ('velocity="left-wheel speed"*2', Signal("", "left-wheel speed", 2.0, 0.0)),
         ('velocity="a:b*c"', Signal("", "a:b*c", 1.0, 0.0)),
+        ('velocity="a b=c"*2', Signal("", "a b=c", 2.0, 0.0)),
+        ('velocity="say ""a"""', Signal("", 'say "a"', 1.0, 0.0)),
         ("velocity=/plot/juggler/column", Signal("", "/plot/juggler/column", 1.0, 0.0)),
         ("count=/enc.ticks:counts", Signal("/enc", "ticks", 1.0, 0.0, "ticks")),
         ("time=Timestamp(ms):ms", Signal("", "Timestamp(ms)", 1.0, 0.0, "ms")),
@@ -134,3 +136,9 @@ def test_a_level_that_no_column_holds_is_written_in_the_mapping(tmp_path: Path) 
     path.write_text("t,w\n" + "\n".join(f"{0.01 * k},{20 * k}" for k in range(30)))
     record = read_records(path, ["voltage=w*0+12 velocity=w time=t"])["motor"]
     assert np.all(record.voltage == 12.0)
+
+
+@pytest.mark.parametrize("name", ["a-b", "1", "a b", "ä", "a\n"])
+def test_a_wheel_needs_a_ros_name(name: str) -> None:
+    with pytest.raises(BagError, match="is no ROS name"):
+        of({"motors": {name: {"voltage": "u", "velocity": "y"}}})
