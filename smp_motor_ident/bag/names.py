@@ -24,6 +24,14 @@ ROLES = {
 }
 MOTIONS = ("velocity", "position", "count")
 NO_VOLTAGE = r"twist|cmd_vel|linear|angular|batter|supply|vbat"
+TORQUE = r"effort"
+"""What is a torque [N m] in ``sensor_msgs/JointState``, and the command of some drivers."""
+ELSEWHERE = (
+    r"pose(?:$|\W|_|[A-Z])|orientation|quaternion|(?:^|\W|_)(?:linear|angular)(?:$|\W|_)|translation"
+    r"|transform|accel|gyro|magnet|(?:^|\W|_)(?:odom|gps|imu|point)(?:$|\W|_)"
+)
+"""What is of the robot's place and not of a motor."""
+DRIVES = WORDS_OF_VOLTS + r"|pwm|duty|throttle"
 MAY_BE_SUPPLY = r"(?:^|\W|_)v_?in(?:$|\W|_)"
 NO_MOTION = (
     r"set_?point|target|desired|refer[eê]n[ct]|soll|cmd|command|consign|[\W_]m?v$"
@@ -67,10 +75,17 @@ def worded(name: str) -> str:
 def role_of(topic: str, path: str) -> str:
     """Return what a field is by its own name, or else by what it is a part of, or its topic."""
     for text in (*reversed(re.sub(r"\[[^\]]*\]", "", path).split(".")), topic):
-        for role, pattern in ROLES.items():
-            if re.search(pattern, worded(text), re.IGNORECASE):
-                return role
+        said = [r for r, pattern in ROLES.items() if re.search(pattern, worded(text), re.I)]
+        if said[:1] == ["voltage"] and "velocity" in said and not drives_by_name(text):
+            return ""  # the command of a speed
+        if said:
+            return said[0]
     return ""
+
+
+def drives_by_name(text: str) -> bool:
+    """Return whether a name tells a voltage or a share of it, rather than any command."""
+    return re.search(DRIVES, text, re.IGNORECASE) is not None
 
 
 def hint_of(role: str, source: str) -> str:
@@ -98,4 +113,6 @@ def is_barred(role: str, text: str) -> bool:
     """Return whether a type, a topic or a name says that a field is none of its role."""
     if role in ("current", "direction"):
         return False
+    if re.search(ELSEWHERE, text, re.IGNORECASE):
+        return True
     return re.search(NO_VOLTAGE if role == "voltage" else NO_MOTION, text, re.I) is not None

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from smp_motor_control.arrays import Array
+from smp_motor_control.errors import is_ros_name
 from smp_motor_ident.bag import axis, checks, decode, drives, mapping, names, read, storage
 from smp_motor_ident.bag.clock import runs
 from smp_motor_ident.bag.offers import Listing, Offer, Proposal, offers_of
@@ -24,6 +25,7 @@ from smp_motor_ident.errors import BagError
 
 _RADIUS = "in metres: what is measured is the way of the rim"
 _MOST = 20_000  # samples that are looked at
+_SOUGHT = ("voltage", *names.MOTIONS)
 _WIDEST = 16  # columns that are tried where their names tell nothing
 
 
@@ -33,6 +35,7 @@ class _Candidate:
 
     role: str
     wheel: str
+    robot: str
     offer: Offer
     path: str
     time: Array
@@ -40,10 +43,16 @@ class _Candidate:
 
     @property
     def source(self) -> str:
-        if self.offer.topic.startswith("/") and self.path != "value":
-            return f"{self.offer.topic}.{self.path}"
+        """What a mapping calls it, in quotes where that would be read as something else."""
         whole = self.offer.topic or self.path
-        return whole if re.fullmatch(r"[\w()\[\]]+", whole) else f'"{whole}"'
+        if self.offer.topic.startswith("/") and self.path != "value":
+            whole = f"{self.offer.topic}.{self.path}"
+            signal = mapping.parse([f"direction={whole}"]).motors["motor"].signals["direction"]
+            if signal == mapping.Signal(self.offer.topic, self.path):
+                return whole
+        elif re.fullmatch(r"[\w()\[\]]+", whole):
+            return whole
+        return '"' + whole.replace('"', '""') + '"'
 
     @property
     def unit(self) -> str:
@@ -99,7 +108,8 @@ def propose(recording: Recording, offers: list[Offer], types: Types) -> Proposal
 def _of_names_and_data(recording: Recording, offers: list[Offer], types: Types) -> Proposal:
     """Return what names and data tell of fields that belong together."""
     time = _time(offers)
-    every = list(_candidates(recording, offers, types, time))
+    fields = list(_candidates(recording, offers, types, time))
+    every = [c for c in fields if c.value.size]
     alone = recording.is_table and len(offers) == 1
     if alone and time is None:
         time = _rising(every)
@@ -108,7 +118,9 @@ def _of_names_and_data(recording: Recording, offers: list[Offer], types: Types) 
         chosen = [("", pair)]
         remarks = [f"by the data alone: {pair[1].source} follows {pair[0].source}; see to both"]
     if not chosen:
-        return Proposal(remark="; ".join([_reason(every), *remarks]))
+        without = [c.source for c in fields if not c.value.size and c.role in _SOUGHT][:4]
+        remarks += [f"{', '.join(without)}: there is no number in it"] if without else []
+        return Proposal(remark="; ".join([_reason(fields), *remarks]))
     items = []
     for prefix, fields in chosen:
         items += [f"{prefix}{c.role}={c.source}{c.unit}" for c in fields]
@@ -121,14 +133,14 @@ def _of_names_and_data(recording: Recording, offers: list[Offer], types: Types) 
 
 def _by_names(every: Sequence[_Candidate]) -> tuple[list[tuple[str, list[_Candidate]]], list[str]]:
     """Return by wheel what is called a voltage and a motion, and what no data could confirm."""
-    wheels: dict[str, list[_Candidate]] = {}
-    for candidate in _of_motors(every):
-        wheels.setdefault(candidate.wheel, []).append(candidate)
-    shared = [c for c in wheels.get("", []) if c.role == "voltage"]
+    wheels: dict[tuple[str, str], list[_Candidate]] = {}
+    for candidate in _of_motors(_of_robots(every)):
+        wheels.setdefault((candidate.robot, candidate.wheel), []).append(candidate)
     found_by_wheel, remarks = [], []
-    for wheel, fields in sorted(wheels.items()):
+    for (robot, wheel), fields in sorted(wheels.items()):
         ways = [c for c in fields if c.role == "direction"][:1]
-        voltages = [c for c in fields if c.role == "voltage"] or shared
+        shared = wheels.get((robot, ""), []) if wheel else []
+        voltages = [c for c in (*fields, *shared) if c.role == "voltage" and _may_drive(c.value)]
         motions = [c for c in fields if c.role in names.MOTIONS]
         sizes = [c for c in voltages if ways and c.value.size and c.value.min() >= 0]
         chosen = []
@@ -141,9 +153,46 @@ def _by_names(every: Sequence[_Candidate]) -> tuple[list[tuple[str, list[_Candid
         if not chosen and (chosen := _untestable(voltages, motions)):
             remarks.append(_unconfirmed(chosen[0]))
         if chosen:
+            if _is_torque(chosen[0]):
+                remarks.append(_torque(chosen[0]))
             current = [c for c in fields if c.role == "current"][:1]
-            found_by_wheel.append((f"{wheel}." if wheel else "", [*chosen, *used, *current]))
+            name = "_".join(filter(None, (robot, wheel)))
+            found_by_wheel.append((f"{name}." if name else "", [*chosen, *used, *current]))
     return found_by_wheel, remarks
+
+
+def _of_robots(every: Sequence[_Candidate]) -> list[_Candidate]:
+    """Return fields with the namespace that tells robots, or motors, apart: ``/robot1/pwm``."""
+    spaces: dict[tuple[str, str], set[str]] = {}
+    for c in every:
+        space, rest = _namespace(c)
+        spaces.setdefault((rest, c.path), set()).add(space)
+    apart = {space for several in spaces.values() if len(several) > 1 for space in several}
+    robots = [space for space in apart if is_ros_name(space) and not names.wheel_of(space)]
+    return [replace(c, robot=s) if (s := _namespace(c)[0]) in robots else c for c in every]
+
+
+def _namespace(candidate: _Candidate) -> tuple[str, str]:
+    """Return a topic's first name and its others; no first where it has one only."""
+    parts = candidate.offer.topic.split("/", 2)
+    return (parts[1], parts[2]) if len(parts) == 3 and not parts[0] else ("", parts[-1])
+
+
+def _may_drive(value: Array) -> bool:
+    """Return whether a field may be a voltage by its values alone: it is not 0, and no clock."""
+    return bool(value.any()) and drives.clock_of([value]) is None
+
+
+def _is_torque(candidate: _Candidate) -> bool:
+    return re.search(names.TORQUE, candidate.path, re.IGNORECASE) is not None
+
+
+def _torque(candidate: _Candidate) -> str:
+    """Return what is not known of an effort."""
+    return (
+        f"{candidate.source} is a torque [N m] by the documentation of its message, and moves as a "
+        "current does; take it only if your driver writes its command there"
+    )
 
 
 def _of_motors(every: Sequence[_Candidate]) -> list[_Candidate]:
@@ -163,7 +212,7 @@ def _of_motors(every: Sequence[_Candidate]) -> list[_Candidate]:
 
 def _whole_of(path: str) -> str:
     whole, dot, _ = path.partition(".")
-    return whole if dot and whole.isidentifier() else ""
+    return whole if dot and is_ros_name(whole) else ""
 
 
 def _directed(voltage: _Candidate, way: _Candidate) -> _Candidate:
@@ -294,7 +343,7 @@ def _time(offers: list[Offer]) -> _Candidate | None:
         for path in offer.fields if offer.table else []:
             if path != "value" and re.search(TIME_NAMES, path, re.IGNORECASE):
                 empty = np.zeros(0)
-                return _Candidate("time", "", offer, path, empty, empty)
+                return _Candidate("time", "", "", offer, path, empty, empty)
     return None
 
 
@@ -332,8 +381,8 @@ def _candidates(
         kept = np.isfinite(value) & (True if there is None else there)
         wheel = names.wheel_of(f"{offer.topic}.{path}")
         if not (role == "voltage" and _is_supply(path, value[kept])):
-            role = _counted(role, value[kept])
-            yield _Candidate(role, wheel, offer, path, at.astype(np.float64)[kept], value[kept])
+            role, times = _counted(role, value[kept]), at.astype(np.float64)[kept]
+            yield _Candidate(role, wheel, "", offer, path, times, value[kept])
 
 
 def _turn_of(angle: Array) -> float:
@@ -355,17 +404,22 @@ def _is_supply(name: str, value: Array) -> bool:
 
 
 def _explained(voltages: list[_Candidate], motions: list[_Candidate]) -> list[_Candidate]:
-    """Return the voltage that explains a motion best, and the motions that it explains.
+    """Return the voltage that explains a motion best, and the motions that it explains as well.
 
-    Where chance may be what tells two apart, one in volts goes before a share of the supply.
+    Where chance may be what tells two apart, one in volts goes before a share of the supply.  A
+    command that is not called one of a drive must leave half as much, a torque a quarter.
     """
     best: list[_Candidate] = []
     least = np.inf
     for voltage in sorted(voltages, key=lambda c: needs("voltage", c.unit[1:], "supply_voltage")):
         explained = [(c, rest) for c in motions if (rest := _rest(voltage, c)) is not None]
-        if explained and explained[0][1] * (1 + 1 / voltage.value.size) < least:
-            least = explained[0][1]
-            first = {c.role: c for c, _ in reversed(explained)}
+        if not explained:
+            continue
+        rest = min(rest for _, rest in explained)
+        handicap = 4 if _is_torque(voltage) else 1 if names.drives_by_name(voltage.source) else 2
+        if handicap * rest * (1 + 1 / voltage.value.size) < least:
+            least = handicap * rest
+            first = {c.role: c for c, left in reversed(explained) if left < 2 * rest}
             best = [voltage, *(first[role] for role in names.MOTIONS[::-1] if role in first)]
     return best
 

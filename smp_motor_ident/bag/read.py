@@ -37,7 +37,8 @@ def read_experiments(paths: Any, mapping: Any = None) -> dict[str, list[Record]]
     types = Types(asked.msg_files)
     read: dict[str, list[Record]] = {}
     failures: list[BagError] = []
-    topics = {topic for motor in asked.motors.values() for topic in motor.topics}
+    signals = [signal for motor in asked.motors.values() for signal in motor.signals.values()]
+    topics = {signal.topic or signal.field for signal in signals}
     for recording in recordings(paths, topics):
         try:
             for record in read_recording(recording, asked, types):

@@ -187,7 +187,9 @@ def recordings(paths: Any, topics: Collection[str] = ()) -> list[Recording]:
 
 def _joined(every: list[Recording], topics: Collection[str]) -> list[Recording]:
     """Put together the tables that a mapping names as topics; others are then not asked for."""
-    parts = [r for r in every if len(r.files) == 1 and f"/{r.files[0].stem}" in topics]
+    begins = {r.files[0]: f"/{r.files[0].stem}" for r in every if len(r.files) == 1}
+    named = {f for f, name in begins.items() if any(f"{t}.".startswith(f"{name}.") for t in topics)}
+    parts = [r for r in every if r.files[0] in named]
     if len(parts) < 2 or not all(part.is_table for part in parts):
         return every
     stems = [part.files[0].stem for part in parts]

@@ -360,3 +360,121 @@ def test_an_angle_that_starts_again_at_360_is_in_degrees(tmp_path: Path) -> None
     angle = np.rad2deg(np.cumsum(speed) * 0.001) % 360
     listing = list_topics(write(tmp_path / "log.csv", t=T, volts=voltage, angle=angle))[0]
     assert listing.suggestion[1] == "position=angle:deg"
+
+
+def robot(
+    corpus: SimpleNamespace, space: str, efforts: np.ndarray, seed: int, drive: str = "pwm"
+) -> list[object]:
+    """Return the messages of one wheel: joint states with an effort, and what drives it."""
+    number, joints = "std_msgs/msg/Float64", "sensor_msgs/msg/JointState"
+    voltage, speed = motor(seed)
+    sent = []
+    for k in range(N):
+        at = corpus.START + round(1e9 * T[k])
+        data = corpus.serialized(number, data=float(np.rint(voltage[k] / 12 * 255)))
+        sent.append(corpus.Sent(f"{space}/{drive}", number, at, data))
+        joint = dict(name=["left_wheel"], position=np.zeros(0), velocity=speed[k : k + 1])
+        effort = efforts[k : k + 1]
+        data = corpus.serialized(joints, header=corpus.header(at), effort=effort, **joint)
+        sent.append(corpus.Sent(f"{space}/joint_states", joints, at, data))
+    return sent
+
+
+def efforts(kind: str, seed: int = 1) -> np.ndarray:
+    """Return an effort of zeros, of none, or one that moves as a current does."""
+    voltage, speed = motor(seed)
+    current = 0.3 * (voltage - speed / 20)
+    return {"zeros": np.zeros(N), "nan": np.full(N, np.nan), "current": current}[kind]
+
+
+@pytest.mark.parametrize("kind", ["zeros", "nan", "current"])
+@pytest.mark.parametrize("drive", ["pwm", "wheel_command"])
+def test_an_effort_is_not_proposed_in_place_of_the_drive(
+    tmp_path: Path, corpus: SimpleNamespace, kind: str, drive: str
+) -> None:
+    sent = robot(corpus, "", efforts(kind), 1, drive)
+    listing = list_topics(corpus.write_mcap(tmp_path / "bag.mcap", sent))[0]
+    assert listing.suggestion == [
+        f"left.voltage=/{drive}.data:pwm",
+        "left.velocity=/joint_states.velocity[left_wheel]",
+    ]
+    assert asked(listing) == ["pwm_full_scale", "supply_voltage"]
+
+
+def test_an_effort_that_alone_explains_the_motion_is_proposed_with_a_note(
+    tmp_path: Path, corpus: SimpleNamespace
+) -> None:
+    sent = [s for s in robot(corpus, "", motor(1)[0], 1) if "pwm" not in s.topic]
+    listing = list_topics(corpus.write_mcap(tmp_path / "bag.mcap", sent))[0]
+    assert listing.suggestion[0] == "left.voltage=/joint_states.effort[left_wheel]"
+    assert "is a torque [N m] by the documentation of its message" in listing.remark
+
+
+def test_every_robot_of_a_bag_is_proposed(tmp_path: Path, corpus: SimpleNamespace) -> None:
+    both = [m for k in (1, 2) for m in robot(corpus, f"/robot{k}", np.zeros(N), k)]
+    path = corpus.write_mcap(tmp_path / "bag.mcap", sorted(both, key=lambda m: m.stamp))
+    listing = list_topics(path)[0]
+    assert listing.suggestion == [
+        f"robot{k}_left.{what}"
+        for k in (1, 2)
+        for what in (
+            f"voltage=/robot{k}/pwm.data:pwm",
+            f"velocity=/robot{k}/joint_states.velocity[left_wheel]",
+        )
+    ]
+    given = [*listing.suggestion, "pwm_full_scale=255", "supply_voltage=12"]
+    records = read_records(path, given)
+    np.testing.assert_allclose(records["robot2_left"].velocity, motor(2)[1])
+
+
+def test_a_time_is_not_proposed_as_a_voltage(tmp_path: Path) -> None:
+    voltage, speed = motor(1)
+    path = write(tmp_path / "log.csv", t=T, input=1e3 * T, pwm=voltage, speed=speed)
+    assert list_topics(path)[0].suggestion[:2] == ["voltage=pwm:pwm", "velocity=speed"]
+    path = write(tmp_path / "none.csv", t=T, input=1e3 * T, speed=speed)
+    assert list_topics(path)[0].suggestion == []
+
+
+def test_a_place_is_not_proposed_where_a_speed_is_named(tmp_path: Path) -> None:
+    voltage, speed = motor(1)
+    columns = {"pose.x": voltage, "pose.y": np.cumsum(speed), "speed": speed}
+    path = write(tmp_path / "log.csv", t=T, **columns, motor_current=0.3 * voltage)
+    listing = list_topics(path)[0]
+    assert listing.suggestion == [] and listing.remark == "no field is called a voltage"
+
+
+def test_a_speed_command_is_not_proposed_as_a_voltage(tmp_path: Path) -> None:
+    voltage, speed = motor(1)
+    path = write(tmp_path / "log.csv", t=T, speed_cmd=20 * voltage, u=voltage, speed=speed)
+    assert list_topics(path)[0].suggestion[0] == "voltage=u"
+    path = write(tmp_path / "none.csv", t=T, speed_cmd=20 * voltage, speed=speed)
+    assert list_topics(path)[0].suggestion == []
+
+
+@pytest.mark.parametrize("column", ["position", "voltage"])
+def test_a_column_without_a_number_is_named(tmp_path: Path, column: str) -> None:
+    columns = {"t": T, "voltage": motor(1)[0], "position": np.cumsum(motor(1)[1])}
+    path = write(tmp_path / "log.csv", **{**columns, column: np.full(N, np.nan)})
+    listing = list_topics(path)[0]
+    assert listing.offers[0].fields == ["t", "voltage", "position"]
+    assert f"{column}: there is no number in it" in listing.remark
+
+
+@pytest.mark.parametrize(
+    "name", ["speed (rad/s)", "speed-2", 'a "fast" speed', "speed b=c", "v: speed", "/a.speed*2"]
+)
+def test_a_name_that_is_printed_is_accepted_back(tmp_path: Path, name: str) -> None:
+    voltage, speed = motor(1)
+    path = tmp_path / "my log.csv"
+    quoted = '"' + name.replace('"', '""') + '"'
+    rows = [f"{t!r},{u!r},{y!r}" for t, u, y in zip(T.tolist(), voltage.tolist(), speed.tolist())]
+    path.write_text("\n".join([f"t,volt,{quoted}", *rows]))
+    listing = list_topics(path)[0]
+    assert listing.suggestion[1].startswith("velocity=")
+    record = read_records(path, [" ".join(listing.suggestion)])["motor"]
+    np.testing.assert_allclose(record.velocity, speed)
+    other = write(tmp_path / "u.csv", t=T, volt=voltage)
+    whole = '"/my log.' + name.replace('"', '""') + '"'
+    items = [f"voltage=/u.volt velocity={whole} time=t"]
+    record = read_records([other, path], items)["motor"]
+    np.testing.assert_allclose(record.velocity, speed)
