@@ -67,9 +67,10 @@ def _on_beat(motor: Motor, topic: str, time: Integers) -> Integers:
     table = motor.tables[topic]
     together = np.diff(time) == 0
     if together.any():
-        alike = [np.diff(column)[together] == 0 for column in table.columns.values()]
-        if np.mean(np.all(alike, axis=0)) > 0.5:
-            return time  # rows that are there twice, not samples that came at once
+        alike = np.all([np.diff(column) == 0 for column in table.columns.values()], axis=0)
+        # What is held is alike whenever it comes; what is there twice only at one time
+        if np.mean(alike[together]) > 0.5 > np.mean(alike[~together]):
+            return time
     beat = find_beat(time)
     if beat is None:
         return time
@@ -93,7 +94,12 @@ def _on_beat(motor: Motor, topic: str, time: Integers) -> Integers:
 def _check(motor: Motor, series: dict[str, Series]) -> None:
     """Leave out values that cannot be, and a current without sign; give a size its direction."""
     if "direction" in series:
-        series["voltage"] = checks.signed(series["voltage"], series.pop("direction"), motor.where)
+        way = series.pop("direction")
+        if checks.has_sign(series["voltage"].value):
+            text = "the voltage has a sign already, so that the direction is not used; leave it out"
+            motor.tell("direction_not_used", text)
+        else:
+            series["voltage"] = checks.signed(series["voltage"], way, motor.where)
     for name in sorted(series, key=lambda name: name != "count"):
         value = series[name].value
         if name == "count":  # which wraps, and that is no jump

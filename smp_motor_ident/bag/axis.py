@@ -11,13 +11,16 @@ from numpy.typing import NDArray
 from smp_motor_control.arrays import Array, Flags, Integers
 from smp_motor_ident.bag.clock import BEATS, mean_held, recorded_at, rhythm
 from smp_motor_ident.bag.counter import Unwrapped, angle_resets, reset_found, unwrap
-from smp_motor_ident.bag.drives import answers_in_its_row
+from smp_motor_ident.bag.drives import answers_in_its_row, rows_behind
 from smp_motor_ident.bag.mapping import MotorMap
+from smp_motor_ident.bag.names import MOTIONS
 from smp_motor_ident.bag.storage import Table, found
 from smp_motor_ident.errors import BagError
 from smp_motor_ident.finding import Finding, Severity
 from smp_motor_ident.record import Hardware, Record
 
+LEAST_ROWS = 2  # one is that of a voltage that held up to its row
+MOST_ROWS = 20_000  # that are looked at for that
 BRIDGED = 2  # samples that may be lost in a row before a new segment begins
 
 
@@ -91,6 +94,8 @@ def on_one_axis(motor: Motor, series: dict[str, Series], axis_name: str) -> Reco
     if all(column is None for column in columns.values()):
         raise BagError(f"{motor.where}: no output has a finite value")
     columns["voltage"] = values
+    if not motor.plan.own:
+        axis, columns, starts = _in_time(motor, axis, columns, starts)
     axis, columns, starts = _without_stubs(motor, axis, columns, starts)
     if axis.size < 2:
         raise BagError(f"{motor.where}: fewer than 2 samples in a row are left")
@@ -105,6 +110,36 @@ def on_one_axis(motor: Motor, series: dict[str, Series], axis_name: str) -> Reco
         recorded=recorded_at(motor.tables[topic].logged for topic in motor.plan.topics),
         **columns,
     )
+
+
+def _in_time(
+    motor: Motor, axis: Integers, columns: dict[str, Any], starts: Flags
+) -> tuple[Integers, dict[str, Any], Flags]:
+    """Move a voltage back that is recorded rows after it acts."""
+    edges = np.append(np.flatnonzero(starts), axis.size)
+    longest = int(np.argmax(np.diff(edges)))
+    part = slice(edges[longest], min(edges[longest + 1], edges[longest] + MOST_ROWS))
+    name, motion = next((n, v[part]) for n in MOTIONS if (v := columns.get(n)) is not None)
+    if not rhythm(axis[part]).regular or not np.isfinite(motion).all():
+        return axis, columns, starts
+    if name != "velocity":
+        motion = np.diff(motion, prepend=motion[:1])
+    rows = rows_behind(columns["voltage"][part], motion.astype(np.float64))
+    if rows < LEAST_ROWS:
+        return axis, columns, starts
+    late = rows * rhythm(axis[part]).interval * 1e-9
+    text = (
+        f"the voltage is recorded {1e3 * late:.3g} ms ({rows} rows) after it acts: the motion is "
+        "ahead of it, or was smoothed both ways; it was moved back"
+    )
+    motor.tell("voltage_late", text, "warning", rows=rows, late=late)
+    keep = np.concatenate([np.arange(a, b) < b - rows for a, b in pairwise(edges)])
+    if not keep.any():
+        raise BagError(f"{motor.where}: no segment is longer than the {rows} rows of that")
+    voltage = np.roll(columns["voltage"], -rows)
+    kept = {n: None if v is None else v[keep] for n, v in {**columns, "voltage": voltage}.items()}
+    begun = np.cumsum(starts)[keep]
+    return axis[keep], kept, np.concatenate([[True], np.diff(begun) > 0])
 
 
 def _held(motor: Motor, voltage: Series, output: Series, name: str, starts: Flags) -> str:

@@ -5,7 +5,7 @@ from scipy.ndimage import median_filter
 
 from smp_motor_control.arrays import Array, Flags
 from smp_motor_ident.bag.axis import Series
-from smp_motor_ident.bag.limits import JUMP_SPAN, JUMP_STEP, UNSIGNED_CURRENT
+from smp_motor_ident.bag.limits import JUMP_SPAN, JUMP_STEP, STRAY_ROWS, UNSIGNED_CURRENT
 from smp_motor_ident.errors import BagError
 
 _LEAST = 50
@@ -65,6 +65,12 @@ def is_unsigned(voltage: Series, current: Series) -> bool:
         return False
     low, high = np.quantile(amperes, [0.05, 0.95])
     return bool(low > -0.2 * high)  # but for little that is given back to the supply
+
+
+def has_sign(value: Array) -> bool:
+    """Return whether a signal goes both ways by itself, but for stray values."""
+    least = STRAY_ROWS.value * np.count_nonzero(value)
+    return bool(min(np.sum(value > 0), np.sum(value < 0)) > least)
 
 
 def signed(size: Series, direction: Series, where: str) -> Series:

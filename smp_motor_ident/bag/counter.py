@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from smp_motor_control.arrays import Array, Integers
-from smp_motor_ident.bag.limits import SATURATED, WIDTH_KNOWN
+from smp_motor_ident.bag.limits import ALIASED, ALMOST_HALF, SATURATED, WIDTH_KNOWN
 from smp_motor_ident.bag.storage import found
 from smp_motor_ident.errors import BagError
 from smp_motor_ident.finding import Finding
@@ -135,6 +135,8 @@ def unwrap(count: Integers, bits: int | None, expected: Array | None = None) -> 
         findings.append(reset_found("encoder's counter", resets.size))
         steps = steps.copy()
         steps[resets - 1] = np.diff(count)[resets - 1]
+    if bits and bits < 62 and expected is None:
+        check_aliasing(steps.astype(np.float64), 2.0**bits, "encoder's count")
     whole = np.concatenate([count[:1], count[:1] + np.cumsum(steps)])
     for begin, end in zip(resets, [*resets[1:], count.size]):
         whole[begin:end] += count[begin] - whole[begin]
@@ -243,4 +245,26 @@ def unwrap_angle(angle: Array) -> tuple[Array, float]:
             )
     result = angle.copy()
     result[sound] = undone(values, width)
+    check_aliasing(np.diff(result[sound]), width, "angle")
     return result, width
+
+
+def check_aliasing(steps: Array, width: float, what: str) -> None:
+    """Refuse what turns by more than half of its width from sample to sample.
+
+    Fast turning then goes over into fast turning backwards without slowing down: several times, or
+    once for long at either side.
+    """
+    if np.abs(steps).max(initial=0.0) < ALMOST_HALF.value * width:
+        return
+    fast = np.sign(steps) * (np.abs(steps) > width / 8)
+    before, a, b, after = fast[1:-4], fast[2:-3], fast[3:-2], fast[4:-1]
+    over = (before == a) & (a == -b) & (b == after) & (a != 0)
+    over &= np.abs(np.diff(steps))[2:-2] > width / 2
+    edge = np.abs(steps) > 0.4 * width
+    once = over & (fast[:-5] == before) & (after == fast[5:]) & edge[2:-3] & edge[3:-2]
+    if np.count_nonzero(over) + ALIASED.value * np.count_nonzero(once) >= ALIASED.value:
+        raise BagError(
+            f"the {what} turns by more than half of its {width:.4g} from sample to sample, where "
+            "nobody can tell which way; record it at least twice as often, or record the speed"
+        )

@@ -1,14 +1,22 @@
 """Whether one signal drives another: what tells a voltage and its motion from other fields."""
 
+from itertools import product
+
 import numpy as np
+from scipy.signal import correlate
 from scipy.special import fdtrc, ndtri
 
-from smp_motor_control.arrays import Array
-from smp_motor_ident.bag.limits import EXPLAINS
+from smp_motor_control.arrays import Array, Integers
+from smp_motor_ident.bag.limits import BEHIND_GAIN, BEHIND_LEFT, EXPLAINS
 from smp_motor_ident.diagnosis.limits import HALF_EXPLAINED
 from smp_motor_ident.likelihood.first_order_lag import lagged
 
 LAGS, OWN = 6, 2
+MOST_BEHIND = 200  # rows by which a command is looked for behind its motion
+NEARLY, ALIKE = 0.9, 3.0  # of what is left at other shifts: clearly less, and much the same
+AROUND = 20  # steps from about where a command stands to where it does
+SECOND = (0.0, 0.5, 1.0, 2.0)  # rows of a second lag
+SAMPLED = 5000  # rows that a fit is made of
 BLOCKS = 200  # stretches over which motions are averaged: in them a counter's noise is small
 
 
@@ -65,6 +73,64 @@ def follows(u: Array, y: Array) -> tuple[float, bool]:
     steps = np.diff(y, prepend=y[:1])
     itself = late(u, y) if _alike(u, steps) < HALF_EXPLAINED.value else 0.0
     return max((itself, False), (late(u, steps), True))
+
+
+def rows_behind(u: Array, y: Array) -> int:
+    """Return by how many rows a command stands behind the motion that it drives; 0 where it leads.
+
+    A cross-correlation of lags of the first order with the motion tells about where; around it,
+    friction and the lag are fitted at every shift.  A motion that was smoothed over a window both
+    ways is one that was averaged over it as it came, ahead by half of it.
+    """
+    most = min(y.size // 10, MOST_BEHIND)
+    u, y = u - u.mean(), y - y.mean()
+    if most < 4 or not (np.any(u) and np.any(y)):
+        return 0
+    shifts = np.arange(-most, most + 1)
+    lags = np.geomspace(0.5, y.size / 20, 12)
+    shares = np.array([_alike_shifted(lagged(u - u[0], float(lag)), y, shifts) for lag in lags])
+    rest = 1 - shares.max(axis=0)
+    about = int(shifts[np.argmin(rest)])
+    # Of a periodic motion much the same is left a period, or half of it, nearer to none
+    nearer = shifts[(rest < ALIKE * rest.min()) & (np.abs(shifts) < abs(about) - 10)]
+    about = min([about, *nearer.tolist()], key=abs)
+    if not 0 < about < most or rest[most + about] > NEARLY * rest[: most + 1].min():
+        return 0
+    lag = float(lags[np.argmax(shares.max(axis=1))])
+    left = {shift: _left(u, y, shift, lag) for shift in range(-3, 1)}
+    best = about
+    for _ in range(AROUND):  # towards where least is left
+        near = range(max(best - 2, 1), min(best + 2, most) + 1)
+        left |= {shift: _left(u, y, shift, lag) for shift in near if shift not in left}
+        if (least := min(near, key=left.__getitem__)) == best:
+            break
+        best = least
+    leading = min(left[shift] for shift in range(-3, 1))
+    return best if left[best] < min(BEHIND_LEFT.value, BEHIND_GAIN.value * leading) else 0
+
+
+def _alike_shifted(x: Array, y: Array, shifts: Integers) -> Array:
+    """Return which share of ``y[k]`` a multiple of ``x[k + shift]`` explains at each shift."""
+    x = x - x.mean()
+    both = correlate(x, y, "full")[y.size - 1 + shifts]
+    own, moved = (np.concatenate([[0.0], np.cumsum(v**2)]) for v in (x, y))
+    begin, end = np.maximum(shifts, 0), y.size + np.minimum(shifts, 0)
+    size = (own[end] - own[begin]) * (moved[end - shifts] - moved[begin - shifts])
+    return np.asarray(both**2 / np.where(size > 0, size, np.inf))
+
+
+def _left(u: Array, y: Array, shift: int, lag: float) -> float:
+    """Return which share of a motion a shifted command leaves, behind a lag and friction."""
+    u, y = (u[shift:], y[: y.size - shift]) if shift > 0 else (u[: u.size + shift], y[-shift:])
+    every = max(y.size // SAMPLED, 1)
+    best = np.inf
+    for trial, second in product(lag * np.geomspace(0.4, 2.5, 25), SECOND):
+        columns = (lagged(u, trial), lagged(np.sign(y), trial), np.ones(y.size))
+        columns = (lagged(columns[0], second), *columns[1:])
+        matrix = np.stack(columns, axis=1)[::every]
+        rest = np.linalg.lstsq(matrix, y[::every], rcond=None)[1]
+        best = min(best, float(rest[0]) if rest.size else np.inf)
+    return best / float(np.sum((y[::every] - y[::every].mean()) ** 2))
 
 
 def late(u: Array, y: Array) -> float:

@@ -26,7 +26,7 @@ WIDEST = Limit(
 DEFINED = Limit(
     500_000,
     "byte",
-    "cost: 1.5 s for one definition of a message type, eight times as much for all of a recording; "
+    "cost: 1.5 s for one definition of a message type, six times as much for all of a recording; "
     "with all that they refer to and their comments real ones have up to 150 kB",
     "test_hostile.py",
 )
@@ -53,6 +53,20 @@ UNSIGNED_CURRENT = Limit(
     "1",
     "physical: an armature's means in both directions cancel but for an offset; a size's add up",
     "test_checks.py",
+)
+BEHIND_LEFT = Limit(
+    0.1,
+    "1",
+    "cost: a command is moved only where a first-order lag then explains nine tenths of the "
+    "motion; where less is explained something else is wrong",
+    "test_late_voltage.py",
+)
+BEHIND_GAIN = Limit(
+    0.6,
+    "1",
+    "cost: what no shift forward explains must shrink by two fifths; friction and a winding leave "
+    "as much at every shift",
+    "test_late_voltage.py",
 )
 EXPLAINS = Limit(
     1e-6,
@@ -86,6 +100,19 @@ SATURATED = Limit(
     "1",
     "physical: a counter that turns stands at the last number of its width for a sample, a full "
     "one as long as the motor turns on",
+    "test_counter.py",
+)
+ALIASED = Limit(
+    3.0,
+    "1",
+    "physical: no motor reverses at full speed from one sample to the next; a fault may look "
+    "so once or twice",
+    "test_counter.py",
+)
+ALMOST_HALF = Limit(
+    0.46,
+    "1",
+    "cost: of a turn from sample to sample; a motor that stays below may reverse in one sample",
     "test_counter.py",
 )
 COUNTED = Limit(

@@ -32,6 +32,10 @@ ELSEWHERE = (
 )
 """What is of the robot's place and not of a motor."""
 DRIVES = WORDS_OF_VOLTS + r"|pwm|duty|throttle"
+SPEED_COMMAND = (
+    r"twist|cmd_vel|vel_cmd|(?:speed|velocity|rpm)_(?:cmd|command|setpoint|set_point|target|ref)"
+    r"|(?:cmd|command|setpoint|target|desired|ref)(?:_wheel)?_(?:speed|vel|velocity|rpm)"
+)
 MAY_BE_SUPPLY = r"(?:^|\W|_)v_?in(?:$|\W|_)"
 NO_MOTION = (
     r"set_?point|target|desired|refer[eê]n[ct]|soll|cmd|command|consign|[\W_]m?v$"
@@ -81,6 +85,12 @@ def role_of(topic: str, path: str) -> str:
         if said:
             return said[0]
     return ""
+
+
+def is_speed_command(name: str) -> bool:
+    """Return whether a type and a name tell the command of a speed, and no voltage."""
+    speed = re.search(SPEED_COMMAND, worded(name), re.IGNORECASE) is not None
+    return speed and not drives_by_name(name)
 
 
 def drives_by_name(text: str) -> bool:

@@ -14,6 +14,7 @@ from smp_motor_ident.bag import mapping as mappings
 from smp_motor_ident.bag.assemble import assemble
 from smp_motor_ident.bag.decode import collect
 from smp_motor_ident.bag.mapping import MotorMap, Signal, SignalMap
+from smp_motor_ident.bag.names import is_speed_command
 from smp_motor_ident.bag.source import Recording, recordings
 from smp_motor_ident.bag.storage import Channel, Table, found
 from smp_motor_ident.bag.tables import add_time_columns, apart, resolved, self_described, timed
@@ -176,7 +177,8 @@ def _records(recording: Recording, asked: SignalMap, types: Types) -> list[Recor
             for name, mine in apart(recording, wheel, plan, tables):
                 mine = timed(recording, plan, mine) if recording.is_table else mine
                 record = assemble(name, plan, hardware_of(plan.hardware), mine, recording.name)
-                records.append(replace(record, findings=(*findings, *record.findings)))
+                doubts = _doubts(plan, channels)
+                records.append(replace(record, findings=(*findings, *doubts, *record.findings)))
         except BagError as error:
             if not plan.own:
                 raise
@@ -236,6 +238,21 @@ def _plans(recording: Recording, asked: SignalMap, channels: list[Channel]) -> d
             own=not given.signals,
         )
     return plans
+
+
+def _doubts(plan: MotorMap, channels: list[Channel]) -> list[Finding]:
+    """Return what a field's name says against its being a voltage."""
+    voltage = plan.signals["voltage"]
+    name = f"{voltage.topic}.{voltage.field}" if voltage.topic else voltage.field
+    kind = next((c.type for c in channels if c.topic == voltage.topic), "")
+    if plan.own or not is_speed_command(f"{kind} {name}"):
+        return []
+    scaled = bool(voltage.unit) or (voltage.scale, voltage.offset) != (1.0, 0.0)
+    text = (
+        f"voltage: {name} is by its name the command of a speed: where a loop controls the speed, "
+        "the numbers are those of the loop and not of a motor; map the PWM or the voltage"
+    )
+    return [found("speed_command", text, "warning" if scaled else "unreliable")]
 
 
 def _description(

@@ -182,7 +182,19 @@ def recordings(paths: Any, topics: Collection[str] = ()) -> list[Recording]:
         every += inside
     if not every:
         raise BagError("no bag is given")
-    return _joined(every, topics)
+    return _of_columns(_joined(every, topics), topics)
+
+
+def _of_columns(every: list[Recording], columns: Collection[str]) -> list[Recording]:
+    """Put together tables each of which has some of the columns that a mapping names."""
+    if len(every) < 2 or not columns or any(not r.is_table or r.one_of_many for r in every):
+        return every
+    held = [{name for c in one.channels() for name in c.fields} & set(columns) for one in every]
+    apart = sum(map(len, held)) == len(set.union(*held)) == len(set(columns))
+    stems = [one.files[0].stem for one in every]
+    if not apart or not all(held) or len(set(stems)) < len(stems):
+        return every
+    return [Recording("+".join(stems), [one.files[0] for one in every])]
 
 
 def _joined(every: list[Recording], topics: Collection[str]) -> list[Recording]:
@@ -212,9 +224,13 @@ def _of_folder(top: Path) -> list[Recording]:
             every.append(_bag(path))
             continue
         here = sorted(path.iterdir())
-        every += _of_files(path.resolve().name, [p for p in here if p.is_file()])
+        every += _of_files(_name(path), [p for p in here if p.is_file()])
         waiting += [p for p in reversed(here) if p.is_dir() and not p.name.startswith(".")]
     return every
+
+
+def _name(path: Path) -> str:
+    return path.name if path.name.strip(".") else path.resolve().name
 
 
 def _of_files(name: str, here: Sequence[Path]) -> list[Recording]:
@@ -252,7 +268,7 @@ def _order(path: Path) -> tuple[str, int]:
 
 def _bag(path: Path) -> Recording:
     """Return a bag by its metadata.yaml, of any version, as far as it can be trusted."""
-    name = path.resolve().name
+    name = _name(path)
     bag = Recording(name, [])
     try:
         with (path / "metadata.yaml").open("rb") as metadata:

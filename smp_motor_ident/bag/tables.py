@@ -116,8 +116,8 @@ def add_time_columns(
         for topic in plan.topics:
             wanted[topic] += [n for n in _telling(recording, topic) if n not in wanted[topic]]
             signal = _time_signal(recording, plan, topic)
-            if signal is not None and signal.field not in wanted[topic]:
-                wanted[topic].append(signal.field)
+            if signal is not None and signal.field not in wanted[signal.topic]:
+                wanted[signal.topic].append(signal.field)
 
 
 def _time_signal(recording: Recording, plan: MotorMap, topic: str) -> Signal | None:
@@ -126,8 +126,13 @@ def _time_signal(recording: Recording, plan: MotorMap, topic: str) -> Signal | N
     if channel is None or set(channel.fields) <= {"value"} or channel.fields[:1] == ("value[0]",):
         return None  # an entry with times of its own
     mapped = plan.signals.get("time")
-    if mapped is not None and (mapped.topic == topic or mapped.field in channel.fields):
-        return replace(mapped, topic=topic, unit=_unit("time", mapped, channel, mapped.field))
+    others = [(s.topic, s.field) for name, s in plan.signals.items() if name != "time"]
+    if mapped is not None:
+        own = mapped.field in channel.fields and (topic, mapped.field) not in others
+        if mapped.topic == topic or own:
+            return replace(mapped, topic=topic, unit=_unit("time", mapped, channel, mapped.field))
+        if len(channel.fields) == 1 and mapped.topic:
+            return mapped  # the time of its rows is in another file
     if plan.sample_time:
         return None
     likely = [name for name in channel.fields if re.search(TIME_NAMES, name, re.IGNORECASE)]
@@ -200,8 +205,14 @@ def timed(recording: Recording, plan: MotorMap, tables: Mapping[str, Table]) -> 
             if signal is None:
                 log = np.rint(np.arange(size) * (plan.sample_time * 1e9)).astype(np.int64)
             else:
-                log, unit = _nanoseconds(table, signal)
-                if not unit and signal.field not in table.exact:
+                of = tables[signal.topic]
+                log, unit = _nanoseconds(of, signal)
+                if log.size != size:
+                    raise BagError(
+                        f"{recording.name}: {topic} has {size} rows, and their time "
+                        f"{signal.topic}.{signal.field} has {log.size}; give files of one length"
+                    )
+                if not unit and signal.field not in of.exact:
                     _check_seconds(log, signal, recording)
                 if unit and unit != signal.unit:
                     text = f"{recording.name}: {signal.field} is taken for {unit} since 1970"
@@ -213,7 +224,12 @@ def timed(recording: Recording, plan: MotorMap, tables: Mapping[str, Table]) -> 
             findings.append(found("rows_without_time", text, "warning"))
             log, columns = log[sound], {name: c[sound] for name, c in columns.items()}
         if not log.size:
-            raise BagError(f"{recording.files[0]}: has no rows with a time")
+            raise BagError(f"{recording.files[0]}: has no rows with a time from 1678 to 2262")
+        if log.size > 2 and not np.ptp(log):
+            raise BagError(
+                f"{recording.files[0]}: all {log.size} rows have the same time, "
+                f"{1e-9 * log[0]:g} s: its clock did not run; map sample_time=SECONDS instead"
+            )
         result[topic] = Table(log, None, columns, findings=findings, clocked=True)
     rows = {topic: result[topic] for topic in written}
     return result | clock.laid_out(rows, plan.gap, recording.name)

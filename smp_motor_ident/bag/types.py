@@ -74,7 +74,7 @@ class Types:
     def __init__(self, files: Iterable[str | os.PathLike[str]] = ()) -> None:
         self._given: dict[str, Fields] = {}
         self._seen: set[str] = set()
-        self._left = 8 * DEFINED.value
+        self._left = 6 * DEFINED.value
         for given in files:
             path = Path(given)
             found = (
@@ -126,7 +126,7 @@ class Types:
         self._left -= 0 if text in self._seen else len(text)
         self._seen.add(text)
         if self._left < 0:
-            raise BagError(f"definitions have more than {8 * DEFINED.value:.0f} characters")
+            raise BagError(f"definitions have more than {6 * DEFINED.value:.0f} characters")
 
     def _named(self, name: str) -> dict[str, Fields]:
         """Return a definition by the type's last name where the user's folder says no package."""

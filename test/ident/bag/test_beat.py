@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -172,3 +173,21 @@ def test_how_sure_the_beat_is_of_its_period_is_how_it_scatters() -> None:
     periods, deviations = np.array(found).T
     # A jackknife of eight parts of an edge of a hull errs to the safe side, by 2.2 here.
     assert 0.5 < np.sqrt(np.mean(deviations**2)) / np.std(periods - T) < 3.0
+
+
+@pytest.mark.parametrize("held", [1, 40])
+def test_a_held_command_that_comes_in_bunches_is_put_back_on_its_beat(
+    tmp_path: Path, corpus: SimpleNamespace, held: int
+) -> None:
+    number, n = "std_msgs/msg/Float64", 900
+    volts = np.repeat(np.random.default_rng(2).uniform(-6, 6, n // held + 1), held)[:n]
+    sent = [
+        corpus.Sent(topic, number, at, corpus.serialized(number, data=float(value)))
+        for k in range(n)
+        for at in [corpus.START + 30_000_000 * (k // 3 + 1)]
+        for topic, value in (("/pwm", volts[k]), ("/w", np.sin(0.1 * k)))
+    ]
+    record = corpus.read(tmp_path / "bag.mcap", sent, ["voltage=/pwm.data velocity=/w.data"])
+    assert len(record) > n - 5
+    np.testing.assert_allclose(np.diff(record.time), 0.01, rtol=1e-3)
+    assert not [f for f in record.findings if f.code == "duplicate_samples"]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -164,3 +165,53 @@ def test_a_driver_puts_out_no_more_than_its_supply(tmp_path):
     (found,) = (f for f in record.findings if f.code == "beyond_full_scale")
     assert found.evidence["samples"] == 10
     assert "392%" in found.message
+
+
+def signed(folder: Path, direction: str) -> Path:
+    """Write a signed command and a column of its direction."""
+    rng = np.random.default_rng(4)
+    pwm = np.repeat(rng.choice([-80, -40, 0, 40, 80], 30), 20)
+    words = {1: "FWD", 0: "FWD", -1: "REV"}
+    way = [words[int(np.sign(p))] if direction == "own" else "FWD" for p in pwm]
+    rows = [f"{0.01 * k:.2f},{p},{w},{0.3 * p}" for k, (p, w) in enumerate(zip(pwm, way))]
+    (folder / "log.csv").write_text("\n".join(["t,pwm,way,w", *rows]))
+    return folder / "log.csv"
+
+
+@pytest.mark.parametrize("direction", ["own", "one"])
+def test_a_command_that_has_a_sign_needs_no_direction(tmp_path: Path, direction: str) -> None:
+    path = signed(tmp_path, direction)
+    mapping = ["voltage=pwm:% supply_voltage=12 velocity=w time=t"]
+    plain = read_records(path, mapping)["motor"]
+    record = read_records(path, [*mapping, "direction=way"])["motor"]
+    np.testing.assert_array_equal(record.voltage, plain.voltage)
+    assert "leave it out" in next(
+        f.message for f in record.findings if f.code == "direction_not_used"
+    )
+
+
+@pytest.mark.parametrize(
+    ("field", "severity"),
+    [
+        ("/cmd_vel.linear.x", "unreliable"),
+        ("/cmd_vel.linear.x*24", "warning"),
+        ("/motor/speed_cmd.data", "unreliable"),
+        ("/motor/pwm_cmd.data", None),
+    ],
+)
+def test_a_speed_command_mapped_as_a_voltage_is_told(
+    tmp_path: Path, corpus: SimpleNamespace, field: str, severity: str | None
+) -> None:
+    number, twist = "std_msgs/msg/Float64", "geometry_msgs/msg/Twist"
+    vector = corpus.TYPES.types["geometry_msgs/msg/Vector3"]
+    topic, sent = field.split(".")[0], []
+    for k in range(200):
+        at, value = corpus.START + 10**7 * k, float(k // 20 % 3)
+        data = corpus.serialized(number, data=value)
+        if topic == "/cmd_vel":
+            data = corpus.serialized(twist, linear=vector(value, 0, 0), angular=vector(0, 0, 0))
+        sent.append(corpus.Sent(topic, twist if topic == "/cmd_vel" else number, at, data))
+        sent.append(corpus.Sent("/w", number, at, corpus.serialized(number, data=value)))
+    record = corpus.read(tmp_path / "bag.mcap", sent, [f"voltage={field} velocity=/w.data"])
+    found = [f.severity for f in record.findings if f.code == "speed_command"]
+    assert found == ([] if severity is None else [severity])

@@ -386,3 +386,36 @@ def test_the_roundest_width_is_found_at_once_however_many_are_admitted() -> None
     assert counts_of(Wrap(3.1e17, 1e16, 5), 10**9) == 2**58
     assert counts_of(Wrap(2.0e17 - 100, 1e14, 5), 10**9) % 1000 == 0
     assert counts_of(Wrap(1999.8, 0.1, 5), 1990) == 2000
+
+
+def folded(top: float, lag: float, drive: str) -> np.ndarray:
+    """An angle within a turn of a motor whose speed comes to so many half turns a sample."""
+    k = np.arange(2000)
+    levels = np.repeat(np.random.default_rng(5).uniform(-1, 1, 50), 40)
+    target = {"levels": levels, "sine": np.sin(k / 30), "step": np.where(k < 200, 0.0, 1.0)}[drive]
+    speed = np.zeros(k.size)
+    for n in range(1, k.size):
+        speed[n] = speed[n - 1] + (np.pi * top * target[n] - speed[n - 1]) / lag
+    return np.mod(np.cumsum(speed), 2 * np.pi)
+
+
+@pytest.mark.parametrize("drive", ["levels", "sine", "step"])
+@pytest.mark.parametrize("lag", [4.0, 15.0])
+def test_more_than_half_a_turn_a_sample_is_refused_as_aliasing(drive: str, lag: float) -> None:
+    angle, width = unwrap_angle(folded(0.9, lag, drive))
+    assert width == 2 * np.pi and np.abs(np.diff(angle)).max() < np.pi
+    with pytest.raises(BagError, match=r"turns by more than half of its 6\.283 from"):
+        unwrap_angle(folded(1.5, lag, drive))
+
+
+@pytest.mark.parametrize("faults", [1, 2])
+def test_a_fault_of_a_fast_angle_is_no_aliasing(faults: int) -> None:
+    angle = folded(0.9, 15.0, "levels")
+    angle[[500, 900][:faults]] += 3.0
+    assert unwrap_angle(np.mod(angle, 2 * np.pi))[1] == 2 * np.pi
+
+
+def test_a_narrow_counter_that_turns_over_half_of_its_width_is_refused() -> None:
+    counts = np.rint(folded(1.5, 15.0, "levels") / (2 * np.pi) * 256).astype(np.int64) % 256
+    with pytest.raises(BagError, match="turns by more than half of its 256"):
+        unwrap(counts, 8)

@@ -374,3 +374,67 @@ def test_labels_of_several_words_have_their_units(tmp_path: Path) -> None:
     offer = list_topics(tmp_path / "log.txt")[0].offers[0]
     assert offer.fields == ["PWM percent [%]", "Motor speed [rpm]"]
     assert offer.units == {"PWM percent [%]": "%", "Motor speed [rpm]": "rpm"}
+
+
+@pytest.mark.parametrize("end", [";", " ;", ";\r"])
+def test_a_semicolon_at_the_end_of_every_row_ends_it(tmp_path: Path, end: str) -> None:
+    rows = [f"{20 * k}, {u}, {y}{end}" for k, (u, y) in enumerate(zip(U, Y))]
+    (tmp_path / "log.csv").write_text("\n".join(rows))
+    assert list_topics(tmp_path / "log.csv")[0].offers[0].fields == ["c1", "c2", "c3"]
+    mapping = ["time=c1:ms voltage=c2 velocity=c3:deg/s"]
+    record = read_records(tmp_path / "log.csv", mapping)["motor"]
+    np.testing.assert_allclose(record.velocity, Y * np.pi / 180)
+
+
+def test_shares_are_read_as_they_are_written(tmp_path: Path) -> None:
+    rows = [f"{0.02 * k},{u}%,{y}" for k, (u, y) in enumerate(zip(U, Y))]
+    (tmp_path / "log.csv").write_text("\n".join(["t,u,y", *rows]))
+    record = read_records(tmp_path / "log.csv", [*MAP, "supply_voltage=12"])["motor"]
+    np.testing.assert_allclose(record.voltage[1:], 0.12 * U[:-1])
+
+
+@pytest.mark.parametrize(
+    ("stamp", "reason"),
+    [("2262-05-01T00:00:00.{:03}", "is no number"), ("0", "all 5 rows have the same time, 0 s")],
+)
+def test_a_time_that_tells_nothing_is_named(tmp_path: Path, stamp: str, reason: str) -> None:
+    rows = [f"{stamp.format(20 * k)},{u},{y}" for k, (u, y) in enumerate(zip(U, Y))]
+    (tmp_path / "log.csv").write_text("\n".join(["t,u,y", *rows]))
+    with pytest.raises(BagError, match=reason):
+        read_records(tmp_path / "log.csv", MAP)
+
+
+def test_elapsed_hours_and_days_are_times(tmp_path: Path) -> None:
+    rows = [f"{25 + k}:00:00.5,{u},{y}" for k, (u, y) in enumerate(zip(U, Y))]
+    (tmp_path / "log.csv").write_text("\n".join(["t,u,y", *rows]))
+    record = read_records(tmp_path / "log.csv", [*MAP, "gap=7200"])["motor"]
+    np.testing.assert_allclose(record.time, 3600.0 * np.arange(5))
+
+
+def columns(folder: Path, *names: str) -> list[Path]:
+    """Write a file a column."""
+    held = {"t": 0.02 * np.arange(5), "u": U, "y": Y}
+    for name in names:
+        (folder / f"{name}.txt").write_text("\n".join([name, *map(repr, held[name].tolist())]))
+    return [folder / f"{name}.txt" for name in names]
+
+
+@pytest.mark.parametrize("mapping", [MAP, ["voltage=/u.u velocity=/y.y:deg/s time=/t.t"]])
+def test_a_recording_of_one_column_a_file_is_put_together(
+    tmp_path: Path, mapping: list[str]
+) -> None:
+    record = read_records(columns(tmp_path, "t", "u", "y"), mapping)["motor"]
+    np.testing.assert_allclose(record.velocity, Y * np.pi / 180)
+    np.testing.assert_allclose(record.time, 0.02 * np.arange(5))
+    given = [
+        mapping[0].replace("time=t", "sample_time=0.1").replace("time=/t.t", "sample_time=0.1")
+    ]
+    record = read_records(columns(tmp_path, "u", "y"), given)["motor"]
+    np.testing.assert_allclose(record.time, 0.1 * np.arange(5))
+
+
+def test_times_of_another_number_of_rows_are_refused(tmp_path: Path) -> None:
+    files = columns(tmp_path, "t", "u", "y")
+    files[0].write_text("t\n0\n1\n")
+    with pytest.raises(BagError, match=r"has 5 rows, and their time /t\.t has 2"):
+        read_records(files, MAP)

@@ -1,0 +1,93 @@
+"""A voltage that is recorded after it acts is moved back; one that leads its motion is not."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from smp_motor_ident.bag import read_records
+from smp_motor_ident.bag.drives import rows_behind
+
+N = 2000
+RNG = np.random.default_rng(17)
+DRIVES = {
+    "levels": np.repeat(RNG.uniform(-8, 8, N // 25), 25),
+    "binary": 6 * np.sign(RNG.normal(size=N)),
+    "sines": sum(2 * np.sin(w * np.arange(N) + w**2) for w in (0.03, 0.11, 0.23, 0.57)),
+    "square": 6 * np.sign(np.sin(np.arange(N) * 2 * np.pi / 200)),
+}
+
+
+def turned(voltage: np.ndarray, lag: float = 8.0, winding: float = 0.0) -> np.ndarray:
+    """Return the speed of a motor with dry friction at the rows' ends, 25 rad/s/V; lags in rows."""
+    speed, driven, out = 0.0, 0.0, []
+    for volts in voltage:
+        for _ in range(10):
+            driven = volts if not winding else driven + 0.1 / winding * (volts - driven)
+            speed += 0.1 / lag * (25 * (driven - 0.3 * np.tanh(20 * speed)) - speed)
+        out.append(speed)
+    return np.array(out)
+
+
+def noisy(speed: np.ndarray, share: float = 0.01) -> np.ndarray:
+    return speed + np.random.default_rng(3).normal(0, share * np.std(speed), speed.size)
+
+
+@pytest.mark.parametrize("drive", list(DRIVES))
+@pytest.mark.parametrize("rows", [2, 3, 10, 40])
+def test_the_rows_that_a_command_is_late_are_found(drive: str, rows: int) -> None:
+    if drive == "square" and rows > 10:
+        pytest.skip("of a square wave most of a half period late is as well the rest of it ahead")
+    speed = noisy(turned(DRIVES[drive]))
+    assert rows_behind(DRIVES[drive][rows:], speed[: N - rows]) == 0  # it leads
+    assert rows_behind(np.roll(DRIVES[drive], rows)[rows:], speed[rows:]) == rows
+
+
+@pytest.mark.parametrize("drive", [*DRIVES, "sine"])
+@pytest.mark.parametrize("winding", [0.0, 2.0])
+@pytest.mark.parametrize("lag", [2.0, 50.0])
+def test_a_command_in_time_is_none(drive: str, lag: float, winding: float) -> None:
+    voltage = DRIVES.get(drive, 6 * np.sin(np.arange(N) * 2 * np.pi / 150))
+    assert rows_behind(voltage, noisy(turned(voltage, lag, winding))) == 0
+
+
+def test_noise_that_a_loop_feeds_back_is_none() -> None:
+    target, speed, rows = np.repeat(RNG.uniform(-100, 100, N // 50), 50), 0.0, []
+    for k in range(N):
+        measured = speed + RNG.normal(0, 3)
+        voltage = 0.1 * (target[k] - measured)
+        rows.append((voltage, measured))
+        speed += 0.1 * (25 * voltage - speed)
+    voltage, measured = np.array(rows).T
+    assert rows_behind(voltage, measured) == 0
+
+
+def test_it_is_told_in_milliseconds() -> None:
+    voltage = RNG.normal(size=20_000)
+    rows_behind(voltage[:500], voltage[:500])  # compiles
+    begin = time.perf_counter()
+    rows_behind(voltage, np.cumsum(voltage))
+    assert time.perf_counter() - begin < 5.0  # on a busy machine
+
+
+@pytest.mark.parametrize("motion", ["velocity", "count"])
+def test_a_late_column_is_moved_back_in_every_segment(tmp_path: Path, motion: str) -> None:
+    voltage, path = DRIVES["levels"], tmp_path / "log.csv"
+    speed = turned(voltage)
+    moved = speed if motion == "velocity" else np.rint(np.cumsum(speed) * 0.01 * 318)
+    at = 0.01 * np.arange(N) + 60.0 * (np.arange(N) >= N // 2)
+    late = np.concatenate([np.zeros(3), voltage[:-3]])
+    late[N // 2 : N // 2 + 3] = 0.0
+    rows = (f"{a:.2f},{b:.6f},{c:.6f}" for a, b, c in zip(at, late, moved))
+    path.write_text("\n".join(["t,u,y", *rows]))
+    mapping = [f"voltage=u {motion}=y time=t held=before counts_per_revolution=2000"]
+    record = read_records(path, mapping)["motor"]
+    found = next(f for f in record.findings if f.code == "voltage_late")
+    assert found.evidence == {"rows": 3, "late": pytest.approx(0.03)}
+    assert "30 ms (3 rows) after it acts" in found.message
+    assert record.starts == (0, N // 2 - 3) and len(record) == N - 6
+    np.testing.assert_allclose(record.voltage[: N // 2 - 3], voltage[: N // 2 - 3], atol=1e-6)
+    np.testing.assert_allclose(record.voltage[N // 2 - 3 :], voltage[N // 2 : N - 3], atol=1e-6)
