@@ -1,9 +1,9 @@
-"""Spoilt recordings of every format: what the reader makes of them, in a table.
+"""Spoilt files of every format: what is made of them, in a table.
 
     python benchmarks/fuzz.py [--files 20000] [--seed 1] [--formats mcap csv ...]
 
-Each file is a sound one (written by rosbags, mcap, sqlite3, scipy, openpyxl or by hand) with some
-of its bytes changed, cut off, doubled, moved or replaced by extreme numbers.  Outcomes: an
+Each file is a sound one (written by rosbags, mcap, sqlite3, scipy, h5py, openpyxl or by hand) with
+some of its bytes changed, cut off, doubled, moved or replaced by extreme numbers.  Outcomes: an
 answer; a partial answer with a warning; a refusal of one line.  Anything else fails: a
 traceback, more than 30 s, more than 1 GB of memory.  Every failure is printed with its number.
 """
@@ -11,6 +11,7 @@ traceback, more than 30 s, more than 1 GB of memory.  Every failure is printed w
 from __future__ import annotations
 
 import argparse
+import contextlib
 import io
 import json
 import multiprocessing
@@ -29,6 +30,7 @@ from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
 from typing import Any
 
+import h5py
 import lz4.frame
 import mcap.writer
 import numpy as np
@@ -39,13 +41,17 @@ import zstandard
 from rosbags.rosbag1 import Writer as Ros1Writer
 from rosbags.typesys import Stores, get_typestore
 
+from smp_motor_control.parameter_file import written
 from smp_motor_ident.bag import list_topics, load, read_records
+from smp_motor_ident.cli.tune import main as main_of_tune
 from smp_motor_ident.errors import BagError, SignalError
 
 N = 120
 SECONDS, MEMORY = 30, 1_000_000_000
 MESSAGES = ["voltage=/pwm.data velocity=/joint_states.velocity[right]"]
 COLUMNS = ["voltage=u velocity=y time=t"]
+COUNTS = ["voltage=u count=y time=t counts_per_revolution=2000"]
+TUNE = ["--supply", "12", "--rate", "100", "--export"]
 _RNG = np.random.default_rng(5)
 T, U, Y = 0.01 * np.arange(N), _RNG.uniform(-6, 6, N), np.cumsum(_RNG.normal(0, 1, N))
 
@@ -169,6 +175,55 @@ def _sysid() -> bytes:
     return json.dumps({"sysid": True, "units": "Rotations", "slow-forward": rows}).encode()
 
 
+def _frc() -> bytes:
+    rows = np.stack([T, 12 + 0 * T, U / 12, U, Y, Y], axis=1).tolist()
+    return json.dumps(
+        {"units": "Degrees", "unitsPerRotation": 360.0, "slow-forward": rows}
+    ).encode()
+
+
+def _counts(bits: int) -> bytes:
+    counts = np.cumsum(np.rint(40 * Y)).astype(np.int64) % 2**bits
+    return "\n".join(["t,u,y", *map("{:.2f},{:.3f},{}".format, T, U, counts)]).encode()
+
+
+def _angle() -> bytes:
+    angle = np.mod(np.cumsum(Y) / 10, 2 * np.pi)
+    return "\n".join(["t,u,y", *map("{:.2f},{:.3f},{:.5f}".format, T, U, angle)]).encode()
+
+
+def _dated() -> bytes:
+    stamps = [f"2024-05-01 23:59:{t + 58.5:09.6f}" for t in T]
+    return "\n".join(["t;u;y", *map("{};{:.1f}%;{:.4f};".format, stamps, U, Y)]).encode()
+
+
+def _hdf5() -> bytes:
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder, "a.mat")
+        with h5py.File(path, "w", userblock_size=512) as file:
+            file["t"], file["u"], file["g/y"] = T, U, Y
+        return b"MATLAB 7.3 MAT-file" + path.read_bytes()[19:]
+
+
+def _identification() -> bytes:
+    of = {"value": 25.0, "std": 0.1, "ci95": [24.8, 25.2], "unit": "", "status": "estimated"}
+    gains = {"dc_gain": of, "time_constant": {**of, "value": 0.05}}
+    error = {"frequency": [1.0, 2.0, 4.0], "shown": [0.1, 0.1, 0.1], "bound": [0.2, 0.2, 0.2]}
+    covariance = {"names": list(gains), "matrix": [[0.01, 0.0], [0.0, 1e-8]]}
+    motor = {
+        "model": "first_order", "parameters": {}, "combinations": gains, "covariance": covariance,
+        "residuals": {"white": True, "independent_of_input": True, "model_error": error},
+        "alternatives": [{"dc_gain": 25.0, "delay": 0.0}], "hardware": {"supply_voltage": 12.0},
+        "findings": [], "sources": ["bag"], "sample_time": 0.01, "speed_noise": 0.5,
+    }  # fmt: skip
+    return json.dumps({"schema": 1, "motors": {"front_left": motor}}).encode()
+
+
+def _motors() -> bytes:
+    motor = {"dc_gain": 25.0, "time_constant": 0.05, "gear_ratio": 65.5, "supply_voltage": 12.0}
+    return written({"/**/motor_plant": {"motors": {"left": motor}}}).encode()
+
+
 def _metadata() -> bytes:
     entry = {"name": "/pwm", "type": "std_msgs/msg/Float64", "serialization_format": "cdr"}
     return yaml.safe_dump(
@@ -200,6 +255,14 @@ SEEDS: dict[str, tuple[str, Callable[[], bytes], list[str] | None]] = {
     "jsonl": ("a.jsonl", lambda: "\n".join(map(json.dumps, _rows())).encode(), COLUMNS),
     "xlsx": ("a.xlsx", _xlsx, COLUMNS),
     "csv": ("a.csv", lambda: _csv(","), COLUMNS),
+    "csv counts": ("a.csv", lambda: _counts(16), COUNTS),
+    "csv near 2^62": ("a.csv", lambda: _counts(62), COUNTS),
+    "csv angle": ("a.csv", _angle, ["voltage=u position=y time=t"]),
+    "csv dates": ("a.csv", _dated, [*COLUMNS, "supply_voltage=12"]),
+    "frc": ("a.json", _frc, None),
+    "mat 7.3": ("a.mat", _hdf5, ["voltage=u velocity=g.y time=t"]),
+    "identification": ("identification.json", _identification, None),
+    "motors": ("motors.yaml", _motors, None),
     "csv blanks": ("a.txt", lambda: _csv(" "), COLUMNS),
     "metadata": ("metadata.yaml", _metadata, MESSAGES),
     "mapping": ("map.yaml", lambda: b"motors:\n  left: {voltage: /pwm.data, velocity: y}\n", None),
@@ -212,7 +275,8 @@ EXTREME = [
     *(struct.pack("<Q", v) for v in (0, 2**31, 2**63 - 1, 2**63, 2**64 - 1)),
     *(struct.pack("<d", v) for v in (np.nan, np.inf, 1e300, -1e-300)),
     b"\0", b"\xff" * 16, b"\n", b",", b"[" * 4000, b"{" * 3000, b'{"a":' * 2000, b"9" * 5000,
-    b"1e999", b"&a [*a]", b"- " * 2000, b"\x28\xb5\x2f\xfd", b"\x04\x22\x4d\x18",
+    b"1152921504606846976", b"-9223372036854775808", b"2262-05-01 00:00:00", b"1e18", b"\r;",
+    b'"', b"%", b"1e999", b"&a [*a]", b"- " * 2000, b"\x28\xb5\x2f\xfd", b"\x04\x22\x4d\x18",
 ]  # fmt: skip
 
 
@@ -253,6 +317,8 @@ def outcome(name: str, data: bytes, folder: Path) -> str:
         if name == "mapping":
             load(path)
             return "answer"
+        if name in ("identification", "motors"):
+            return tuned(path)
         if name == "msg":
             (folder / "a.db3").write_bytes(SOUND["sqlite"])
             list_topics(folder / "a.db3", [str(path)])
@@ -270,6 +336,19 @@ def outcome(name: str, data: bytes, folder: Path) -> str:
         f for o in listed for f in o.findings
     ]
     return "partial" if any(f.severity != "note" for f in found) else "answer"
+
+
+def tuned(path: Path) -> str:
+    """Return what ``tune`` makes of a file, which must be a text or one line."""
+    out, err = io.StringIO(), io.StringIO()
+    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+        code = main_of_tune([str(path), *TUNE, "wpilib"])
+    said = [s for s in err.getvalue().splitlines() if not s.startswith("tune: designing")]
+    if code == 0:
+        return "answer" if not said else "partial"
+    if len(said) != 1 or "a defect of this tool" in said[0]:
+        return said[-1][:200] if said else f"code {code} without a word"
+    return "refused"
 
 
 SOUND: dict[str, bytes] = {}
@@ -332,7 +411,7 @@ def main() -> int:
     given = parser.parse_args()
     each = max(given.files // len(given.formats), 1)
     print(f"seed {given.seed}, {each} files of each format")
-    print("format        answer  partial  refused  failed     MB      s")
+    print("format           answer  partial  refused  failed     MB      s")
     every: Counter[str] = Counter()
     bad: list[str] = []
     with ThreadPoolExecutor(given.jobs) as threads:
@@ -340,7 +419,7 @@ def main() -> int:
         for name, counts, failures, used, longest in work:
             three = [counts[key] for key in ("answer", "partial", "refused")]
             print(
-                f"{name:12} {three[0]:7} {three[1]:8} {three[2]:8} {each - sum(three):7} "
+                f"{name:15} {three[0]:7} {three[1]:8} {three[2]:8} {each - sum(three):7} "
                 f"{used / 1e6:6.0f} {longest:6.1f}",
                 flush=True,
             )

@@ -87,6 +87,17 @@ def role_of(topic: str, path: str) -> str:
     return ""
 
 
+def of_a_place(paths: Sequence[str]) -> set[str]:
+    """Return the fields that are a robot's place: x and y beside the way that it faces."""
+    by_name: dict[tuple[str, str], str] = {}
+    for path in paths:
+        whole, dot, name = path.rpartition(".")
+        by_name[whole + dot, name.lower()] = path
+    faced = {whole for whole, name in by_name if name in ("theta", "yaw", "heading", "phi", "psi")}
+    both = {whole for whole in faced if (whole, "x") in by_name and (whole, "y") in by_name}
+    return {path for (whole, name), path in by_name.items() if whole in both and name in "xyz"}
+
+
 def is_speed_command(name: str) -> bool:
     """Return whether a type and a name tell the command of a speed, and no voltage."""
     speed = re.search(SPEED_COMMAND, worded(name), re.IGNORECASE) is not None

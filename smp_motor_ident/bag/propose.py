@@ -353,8 +353,9 @@ def _candidates(
     """Yield the fields whose names say what they may be, and the others of a table."""
     named: list[tuple[str, Offer, str]] = []
     for offer in offers:
+        place = names.of_a_place(offer.fields)
         for path in offer.fields:
-            if (time is not None and path == time.path) or is_time_of_part(path):
+            if (time and path == time.path) or is_time_of_part(path) or path in place:
                 continue
             role = names.role_of(offer.topic, path)
             barred = names.is_barred(role, f"{offer.type} {offer.topic} {path}")

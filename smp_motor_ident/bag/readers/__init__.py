@@ -67,5 +67,7 @@ def _what(path: Path, head: bytes) -> str:
         return "is empty"
     if any(form.magic.startswith(head) for form in FORMATS if form.magic):
         return f"is cut off after {path.stat().st_size} bytes; nothing of it can be read"
+    if head.startswith(b"version https://git-lfs"):
+        return "is a pointer of Git LFS, not the recording; run git lfs pull"
     names = ", ".join(form.name for form in FORMATS)
     return f"is no recording of a known format ({names})"

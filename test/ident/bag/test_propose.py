@@ -443,6 +443,14 @@ def test_a_place_is_not_proposed_where_a_speed_is_named(tmp_path: Path) -> None:
     assert listing.suggestion == [] and listing.remark == "no field is called a voltage"
 
 
+def test_a_place_of_columns_is_no_drive(tmp_path: Path) -> None:
+    voltage, speed = motor(1)
+    theta = 0.01 * np.cumsum(speed)
+    path = write(tmp_path / "log.csv", x=voltage, y=np.cumsum(speed), theta=theta, omega=speed)
+    listing = list_topics(path)[0]
+    assert listing.suggestion == []
+
+
 def test_a_speed_command_is_not_proposed_as_a_voltage(tmp_path: Path) -> None:
     voltage, speed = motor(1)
     path = write(tmp_path / "log.csv", t=T, speed_cmd=20 * voltage, u=voltage, speed=speed)
