@@ -165,7 +165,7 @@ def _width_shown(count: Integers, steps: Integers, guess: Array) -> int:
 
 def is_full(count: Integers) -> int:
     """Return the last number of a width where a counter stays at it, or 0."""
-    for last in (int(count.max()), int(count.min())) if count.size else ():
+    for last in (int(count.max()), int(count.min())) if count.size > 1 else ():
         size = last + 1 if last > 0 else -last  # 2^k - 1 at the upper end, -2^k at the lower
         stays = np.mean((count[1:] == last) & (count[:-1] == last)) > SATURATED.value
         if size >= 2**7 and not size & (size - 1) and stays:

@@ -12,7 +12,7 @@ import numpy as np
 from smp_motor_control.arrays import Integers
 from smp_motor_ident.bag.readers.format import Format, Messages
 from smp_motor_ident.bag.salvage import salvage
-from smp_motor_ident.bag.storage import Batch, Bytes, Channel, join, message_type
+from smp_motor_ident.bag.storage import Batch, Channel, join, message_type
 from smp_motor_ident.bag.unpack import Budget, folder_of
 from smp_motor_ident.errors import BagError
 
@@ -125,15 +125,11 @@ class _SqliteFile(Messages):
         """Yield the last row that is read, and some rows by topic."""
         ids = ",".join(str(key) for key in asked)
         among = "" if len(asked) == len(self._topics) else f"AND topic_id IN ({ids}) "
-        source = (
-            "FROM (SELECT id, topic_id, timestamp, data FROM messages "
-            f"WHERE id > ? {among}ORDER BY id LIMIT {_ROWS})"
+        query = (
+            "SELECT id, topic_id, timestamp, data FROM messages "
+            f"WHERE id > ? {among}ORDER BY id LIMIT {_ROWS}"
         )
         last = _BEFORE
-        while (read := self._in_bulk(source, last)) is not None:
-            last, topic, batch = read
-            yield last, self._by_topic(topic, batch, asked)
-        query = f"SELECT id, topic_id, timestamp, data {source}"
         while rows := self._rows(query, last):
             last = rows[-1][0]
             yield last, self._split(rows, asked)
@@ -151,41 +147,6 @@ class _SqliteFile(Messages):
                 break
         self._budget.take(size + _ROW * len(rows))
         return rows
-
-    def _in_bulk(self, source: str, last: int) -> tuple[int, Integers, Batch] | None:
-        """Let SQLite put rows together in one blob; None where that cannot be trusted.
-
-        One row of Python objects per message takes three times as long.  Numbers come
-        as characters: topic and length as one code point each, times as decimal digits.
-        """
-        query = (
-            "SELECT max(id), group_concat(data, ''), group_concat(timestamp), "
-            f"group_concat(char(topic_id + 1, length(data) + 1), '') {source}"
-        )
-        text, self._database.text_factory = self._database.text_factory, bytes
-        before = last
-        try:
-            last, data, times, codes = self._database.execute(query, (last,)).fetchone()
-            points = np.frombuffer(codes.decode("utf-8").encode("utf-32-le"), np.uint32)
-        except (sqlite3.Error, UnicodeDecodeError, AttributeError):
-            return None
-        finally:
-            self._database.text_factory = text
-        pairs = points.astype(np.int64) - 1
-        topic, length = pairs[0::2], pairs[1::2]
-        digits, rest = divmod(len(times) + 1, topic.size)
-        if topic.size != length.size or len(data) != length.sum() or rest or last <= before:
-            return None
-        table = np.frombuffer(times + b",", np.uint8).reshape(topic.size, digits).T
-        if (table[-1] != ord(",")).any() or (table[:-1] < ord("0")).any():
-            return None
-        self._budget.take(len(data) + _ROW * topic.size)
-        log = np.zeros(topic.size, np.int64)
-        for column in table[:-1]:
-            log = log * 10 + (column - 48)
-        raw: Bytes = np.frombuffer(data, np.uint8)
-        channel = self._topics[0]  # the caller tells topics apart
-        return last, topic, Batch(channel, raw, np.cumsum(length) - length, length, log)
 
     def _salvaged(self, asked: dict[int, Channel], last: int) -> Iterator[list[Batch]]:
         """Yield what single pages still hold behind the last row that the tree gave."""
