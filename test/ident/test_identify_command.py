@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import re
 import subprocess
 import sys
@@ -17,7 +18,7 @@ from browser import CHROMIUM, Browser
 from scipy.signal import cont2discrete, lfilter
 
 from smp_motor_control.motor.file import load_motors
-from smp_motor_ident.cli import identification
+from smp_motor_ident.cli import identification, tune
 from smp_motor_ident.cli.identification import OUTPUTS
 from smp_motor_ident.cli.identify import main
 from smp_motor_ident.finding import Finding
@@ -322,3 +323,26 @@ def test_a_real_motor_is_recovered_and_predicts_another_day(tmp_path: Path) -> N
     assert gain == pytest.approx(159.9, rel=0.03)
     assert 0.030 <= motor["combinations"]["time_constant"]["value"] <= 0.042
     assert motor["fit_percent"]["validation"] >= 93.0
+
+
+def test_paths_that_are_no_utf_8_are_read_and_written(recording: Path, tmp_path: Path) -> None:
+    name = os.fsdecode(b"log\xff\xfe")
+    log, output = tmp_path / f"{name}.csv", tmp_path / name
+    log.write_bytes(recording.read_bytes())
+    given = [*MAP, "--output", str(output), "--force"]
+    assert main([str(log), *given]) == 0
+    document = json.loads((output / OUTPUTS[0]).read_text())
+    assert document["motors"]["motor"]["sources"] == ["log\ufffd\ufffd.csv"]
+    text = (output / OUTPUTS[2]).read_text()
+    assert "log\ufffd\ufffd.csv" in text or "log??.csv" in text
+    assert tune.main([str(output), "--supply", "12", "--output", f"{output}.yaml"]) == 0
+
+
+def test_a_place_where_nothing_can_be_written_is_told_before_the_work(
+    recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    nowhere = "/proc/self/nothing"  # where not even root may write
+    assert main([str(tmp_path / "no.csv"), *MAP, "--output", nowhere]) == 2
+    assert "cannot be written" in capsys.readouterr().err
+    assert tune.main([str(tmp_path), "--output", f"{nowhere}.yaml"]) == 2
+    assert "cannot be written" in capsys.readouterr().err

@@ -398,3 +398,20 @@ def test_of_a_bag_of_ros_1_that_is_cut_off_the_rest_is_read(tmp_path: Path) -> N
     assert N // 4 < len(record) < N
     np.testing.assert_array_equal(record.velocity, SPEED[: len(record)])
     assert any(f.code == "damaged_recording" for f in record.findings)
+
+
+def test_a_workbook_is_read_as_excel_shows_it(tmp_path: Path) -> None:
+    # ECMA-376, 18.8.30: a number format of a share shows a hundred times what is stored; times are
+    # parts of a day
+    book = openpyxl.Workbook()
+    book.active.append(["time", "duty", "speed"])
+    for k in range(N):
+        book.active.append([(TIME[k] + 3600 * 25) / 86_400, VOLTAGE[k] / 12, SPEED[k]])
+        book.active.cell(k + 2, 1).number_format = "[h]:mm:ss.000"
+        book.active.cell(k + 2, 2).number_format = "0.0%"
+    book.save(tmp_path / "log.xlsx")
+    mapping = ["voltage=duty velocity=speed time=time supply_voltage=12"]
+    record = read_records(tmp_path / "log.xlsx", mapping)["motor"]
+    np.testing.assert_allclose(record.velocity, SPEED)
+    np.testing.assert_allclose(record.voltage[1:], VOLTAGE[:-1])
+    np.testing.assert_allclose(record.time, TIME, atol=1e-6)
