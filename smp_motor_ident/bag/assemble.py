@@ -46,6 +46,9 @@ def assemble(
         times |= {topic: _on_beat(motor, topic, times[topic]) for topic in arrivals}
     given = {name: signal for name, signal in plan.signals.items() if name != "time"}
     series = {n: _series(motor, n, signal, times[signal.topic]) for n, signal in given.items()}
+    for name in ("voltage", axis_name):
+        if not np.isfinite(series[name].value).any():
+            raise BagError(f"{motor.where}: {given[name].field} holds no number; map another field")
     together = plan.signals["voltage"].topic == plan.signals[axis_name].topic
     if together:
         _drop_lost(motor, series, axis_name)

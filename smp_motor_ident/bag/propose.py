@@ -119,7 +119,7 @@ def _of_names_and_data(recording: Recording, offers: list[Offer], types: Types) 
         remarks = [f"by the data alone: {pair[1].source} follows {pair[0].source}; see to both"]
     if not chosen:
         without = [c.source for c in fields if not c.value.size and c.role in _SOUGHT][:4]
-        remarks += [f"{', '.join(without)}: there is no number in it"] if without else []
+        remarks += [f"{one} holds no number" for one in without]
         return Proposal(remark="; ".join([_reason(fields), *remarks]))
     items = []
     for prefix, fields in chosen:

@@ -438,3 +438,12 @@ def test_times_of_another_number_of_rows_are_refused(tmp_path: Path) -> None:
     files[0].write_text("t\n0\n1\n")
     with pytest.raises(BagError, match=r"has 5 rows, and their time /t\.t has 2"):
         read_records(files, MAP)
+
+
+@pytest.mark.parametrize("column", ["u", "y"])
+def test_a_column_that_holds_no_number_is_named(tmp_path: Path, column: str) -> None:
+    rows = [("nan" if column == "u" else u, "" if column == "y" else y) for u, y in zip(U, Y)]
+    text = "\n".join(["t,u,y", *(f"{0.02 * k},{u},{y}" for k, (u, y) in enumerate(rows))])
+    (tmp_path / "log.csv").write_text(text)
+    with pytest.raises(BagError, match=f"{column} holds no number"):
+        read_records(tmp_path / "log.csv", MAP)

@@ -465,7 +465,7 @@ def test_a_column_without_a_number_is_named(tmp_path: Path, column: str) -> None
     path = write(tmp_path / "log.csv", **{**columns, column: np.full(N, np.nan)})
     listing = list_topics(path)[0]
     assert listing.offers[0].fields == ["t", "voltage", "position"]
-    assert f"{column}: there is no number in it" in listing.remark
+    assert f"{column} holds no number" in listing.remark
 
 
 @pytest.mark.parametrize(
