@@ -1,11 +1,11 @@
 """A running motor's recent past, read as a bag of it would be."""
 
-import math
 from collections import deque
 from typing import Any
 
 import numpy as np
 
+from smp_motor_control.motor.parameters import SUPPLIES
 from smp_motor_ident.bag.assemble import assemble
 from smp_motor_ident.bag.mapping import MotorMap, Signal
 from smp_motor_ident.bag.read import OWN_FIELDS
@@ -39,7 +39,7 @@ class Window:
 
         A stamp [ns] that was set back begins the window anew.
         """
-        if not math.isfinite(state.voltage):
+        if not abs(state.voltage) <= SUPPLIES[1]:
             return
         rows = self._rows
         if rows and stamp <= rows[-1][0]:

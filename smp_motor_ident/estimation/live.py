@@ -8,6 +8,9 @@ from smp_motor_control.arrays import Array
 from smp_motor_control.fields import described
 from smp_motor_ident.record import Record
 
+ROUNDING = 1e-9
+"""Share by which voltages differ that are one, computed in different ways."""
+
 
 @dataclass(frozen=True)
 class Demands:
@@ -30,8 +33,7 @@ def missing(record: Record | None, demands: Demands) -> list[str]:
     threshold = 0.02 * max(float(np.nanmax(np.abs(speed))), 1e-9)
     forward, backward = float(np.mean(speed > threshold)), float(np.mean(speed < -threshold))
     moving = (forward + backward) * speed.size * step
-    shares = np.histogram(voltage, demands.bins)[0] / voltage.size
-    filled = int(np.sum(shares >= 0.02)) if np.ptp(voltage) > 0 else 1
+    filled = int(np.sum(_shares(voltage, demands.bins) >= 0.02))
     above = voltage > voltage.mean()
     changes = int(np.sum(above[1:] != above[:-1]))
     checks: list[tuple[bool, str]] = [
@@ -46,6 +48,15 @@ def missing(record: Record | None, demands: Demands) -> list[str]:
         ),
     ]
     return [text for met, text in checks if not met]
+
+
+def _shares(voltage: Array, bins: int) -> Array:
+    """Return the shares of the samples in each of the levels; voltages that are equal are one."""
+    low, span = voltage.min(), np.ptp(voltage)
+    if span <= ROUNDING * np.abs(voltage).max():
+        return np.ones(1)
+    level = np.minimum((voltage - low) / span * bins, bins - 1).astype(np.int64)
+    return np.bincount(level, minlength=bins) / voltage.size
 
 
 def _speed(record: Record) -> Array:

@@ -25,7 +25,7 @@ from rclpy.node import Node
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 
 from smp_interfaces.msg import MotorDescription, MotorParameters, MotorState
-from smp_motor_control import WHEELS, joint_of
+from smp_motor_control import WHEELS, check_wheel_names, joint_of
 from smp_motor_control.encoder import wrap
 from smp_motor_control.errors import ParameterError, SmpError
 from smp_motor_control.fields import described, fixed, nested
@@ -64,7 +64,8 @@ class Settings:
     demands: Demands = nested(Demands(), prefix="demands.")
 
     def __post_init__(self) -> None:
-        """Refuse a window that can never meet its demands."""
+        """Refuse wheels that have no topics, and a window that can never meet its demands."""
+        check_wheel_names(self.wheels)
         if self.demands.duration > self.window:
             raise ParameterError(
                 f"demands.duration is {self.demands.duration:g} s; it must not exceed the "
@@ -184,7 +185,7 @@ class Identifier(Node):
             try:
                 record = wheel.window.record()
                 lacks = missing(record, settings.demands)
-            except SmpError as error:
+            except (SmpError, ArithmeticError, ValueError) as error:
                 record, lacks = None, [str(error)]
             if lacks or record is None:
                 wheel.tell("collecting: " + "; ".join(lacks))

@@ -56,6 +56,22 @@ def test_record_is_at_the_motor_shaft_with_counts_unwrapped() -> None:
     assert np.abs(moved - record.velocity[1:]).max() < 2 * np.pi / COUNTS / STEP * 1.01
 
 
+def test_voltages_that_differ_by_a_rounding_are_one_level() -> None:
+    for volts in (12.0, -3.3, 1e-3):
+        voltage = np.full(2000, volts)
+        voltage[::7] = np.nextafter(volts, np.inf)
+        lacks = missing(filled(10.0, voltage).record(), Demands())
+        assert "1 of 3 levels of voltage" in lacks
+
+
+@pytest.mark.parametrize("volts", [np.nan, np.inf, -1e308, 1e308, 1e9])
+def test_a_voltage_that_no_supply_has_is_no_sample(volts: float) -> None:
+    window = filled(20.0)
+    before = len(window)
+    window.add(NOW + 20 * SECOND, state(volts, np.nan, 0.0, 0.0, 0))
+    assert len(window) == before and missing(window.record(), Demands()) == []
+
+
 def test_window_keeps_only_its_length() -> None:
     window = filled(300.0, length=10.0)
     record = window.record()
