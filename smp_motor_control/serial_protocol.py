@@ -3,17 +3,21 @@
 Lines of ASCII that end with ``*`` and the exclusive-or of the characters before it in two
 hexadecimal digits, as NMEA 0183 sentences do; a line whose sum does not fit is dropped.
 
-======================================= ==============================================
-host to board, at most 0.1 s apart      ``V,MV,MV,...``: armature voltages [mV]
-board to host, at its sampling instants ``S,US,BATTERY,COUNT,MA,COUNT,MA,...``
-======================================= ==============================================
+============================================= ========================================
+board to host, at its samples, <= 0.1 s apart ``S,US,BATTERY,COUNT,MA,COUNT,MA,...``
+host to board, <= 0.1 s apart                 ``A,US`` and ``V,MV,MV,...``
+============================================= ========================================
 
 ``US`` is the board's clock [us, modulo 2^32], ``BATTERY`` its supply [mV], ``COUNT`` a signed
-encoder count and ``MA`` a current [mA], empty where it is not measured.  A board that hears no
-valid line for 0.2 s turns its motors off.
+encoder count and ``MA`` a current [mA]; battery and current are empty where they are not measured.
+``V`` holds the armature voltages [mV], and the ``A`` before it the clock of the newest ``S`` that
+the host has heard: a board that compares it with its own clock knows how old the command is, and
+drops what waited in a queue.  A board that hears no valid, fresh ``V`` for 0.2 s turns its motors
+off; a host that hears no ``S`` for as long sends nothing.
 """
 
 import math
+import re
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -26,11 +30,15 @@ CLOCK = 1 << 32
 """The board's clock begins anew after so many microseconds."""
 
 
+_INTEGER = re.compile(r"-?[0-9]{1,18}")
+"""What fits 64 bits and every counter."""
+
+
 class BoardState(NamedTuple):
     """What a board reported at one instant."""
 
     clock: int  # [us], wraps
-    battery: float  # [V]
+    battery: float  # [V]; NaN where not measured
     counts: tuple[int, ...]  # of each motor's encoder
     currents: tuple[float, ...]  # [A]; NaN where not measured
 
@@ -60,6 +68,17 @@ def encode_voltages(voltages: Sequence[float]) -> bytes:
     return encode(",".join(["V", *map(str, numbers)]))
 
 
+def encode_age(clock: int) -> bytes:
+    r"""Return the line that tells a board which of its states the next command answers.
+
+    Examples
+    --------
+    >>> encode_age(20000)
+    b'A,20000*5F\n'
+    """
+    return encode(f"A,{clock}")
+
+
 def decode_state(line: str, motors: int) -> BoardState:
     """Read a board's line."""
     text, _, sum_ = line.strip().rpartition("*")
@@ -68,13 +87,20 @@ def decode_state(line: str, motors: int) -> BoardState:
         raise ParameterError(f"spoilt line {line[:40]!r}")
     if len(fields) != 3 + 2 * motors:
         raise ParameterError(f"line of {(len(fields) - 3) // 2} motors, not of {motors}")
-    try:
-        clock, battery = int(fields[1]), 1e-3 * int(fields[2])
-        counts = tuple(int(field) for field in fields[3::2])
-        currents = tuple(1e-3 * int(field) if field else math.nan for field in fields[4::2])
-    except ValueError:
-        raise ParameterError(f"line with a field that is no number: {line[:40]!r}") from None
-    return BoardState(clock % CLOCK, battery, counts, currents)
+    counts, currents = fields[3::2], fields[4::2]
+    for field in (fields[1], *counts, *filter(None, (fields[2], *currents))):
+        if not _INTEGER.fullmatch(field):
+            raise ParameterError(f"line with a field that is no whole number: {line[:40]!r}")
+    return BoardState(
+        int(fields[1]) % CLOCK,
+        _thousandth(fields[2]),
+        tuple(map(int, counts)),
+        tuple(map(_thousandth, currents)),
+    )
+
+
+def _thousandth(field: str) -> float:
+    return 1e-3 * int(field) if field else math.nan
 
 
 class Lines:

@@ -345,6 +345,22 @@ def test_the_firmware_of_the_page_speaks_the_protocol_and_stops_on_silence(tmp_p
     assert duty == [63, 63, 63, 0]
 
 
+def test_the_firmware_of_the_page_drops_commands_that_waited_in_a_queue(tmp_path):
+    from smp_motor_control.serial_protocol import encode_age, encode_voltages
+
+    (tmp_path / "sketch.ino").write_text(program("docs/howto/micro-controller.md", "cpp"))
+    (tmp_path / "board.cpp").write_text(BOARD)
+    subprocess.run(["c++", "-o", "board", "board.cpp"], cwd=tmp_path, check=True, timeout=120)
+    # Each line takes 10 ms of the board's clock; the command of 3 V answers its sample at 10 ms.
+    command = encode_age(10_000).decode() + encode_voltages([3.0, 3.0]).decode()
+    fresh = encode_age(1_440_000).decode() + encode_voltages([6.0, 6.0]).decode()
+    said = command + "+1400000\n" + command + fresh
+    ran = subprocess.run([tmp_path / "board"], input=said, capture_output=True, text=True,
+                         check=True, timeout=60)  # fmt: skip
+    duty = [int(line.split()[2]) for line in ran.stdout.splitlines() if line.startswith("pwm 5")]
+    assert duty == [0, 63, 0, 0, 0, 0, 127]
+
+
 def test_layouts_draw_what_the_wheels_publish():
     text = (ROOT / "smp_interfaces/msg/PidState.msg").read_text()
     fields = {line.split()[1] for line in text.splitlines() if line and line[0] not in "#"}

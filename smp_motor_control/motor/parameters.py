@@ -20,6 +20,9 @@ PHYSICAL = tuple(_UNITS)
 COMBINATIONS = ("dc_gain", "time_constant", "time_constant_product", "static_voltage")
 """Names of what voltage and speed tell of a motor."""
 
+SUPPLIES = (0.1, 1000.0)
+"""Supply voltages that a wheel's driver can have [V]."""
+
 _MAY_BE_ZERO = ("inductance", "viscous_friction", "coulomb_friction")
 Motion = TypeVar("Motion", float, Array)
 
@@ -133,6 +136,11 @@ class MotorParameters:
     def static_voltage(self) -> float:
         """Voltage at which the unloaded motor breaks loose, ``R Tc / K`` [V]."""
         return self.resistance * self.coulomb_friction / self.motor_constant
+
+
+def check_supply(name: str, voltage: float) -> float:
+    """Return a supply voltage that a driver can have: it limits what a motor is given."""
+    return check_range(name, voltage, *SUPPLIES, "V")
 
 
 @dataclass(frozen=True)

@@ -15,10 +15,12 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.node import Node
 
 from smp_interfaces.msg import MotorCommand, MotorState
 from smp_motor_control.errors import ParameterError
+from smp_motor_control.nodes.serial_driver import Settings
 from smp_motor_control.serial_protocol import Lines, decode_state, encode, encode_voltages
 
 GAIN = 20.0
@@ -37,6 +39,9 @@ class Firmware(threading.Thread):
         self.voltages = [0.0, 0.0]
         self.angles = [0.0, 0.0]
         self.loss = 0.0
+        self.battery: int | str = 12000
+        self.stalled = False
+        self.obeyed: list[list[float]] = []
         self.running = True
         self.draw = random.Random(5)
         self.start_clock = self.heard = time.monotonic()
@@ -65,6 +70,8 @@ class Firmware(threading.Thread):
         while self.running:
             time.sleep(PERIOD)
             now = time.monotonic()
+            if self.stalled:
+                continue
             with contextlib.suppress(OSError):
                 self.listen(lines, now)
             if now - self.heard > 0.2:
@@ -81,13 +88,18 @@ class Firmware(threading.Thread):
             text, _, _ = line.rpartition("*")
             if encode(text).decode().strip() == line and text.startswith("V,"):
                 self.voltages = [1e-3 * int(field) for field in text.split(",")[1:]]
+                self.obeyed.append(self.voltages)
                 self.heard = now
 
     def report(self, now: float) -> bytes:
         clock = int((now - self.start_clock) * 1e6) % (1 << 32)
         counts = [math.floor(a * COUNTS / (2 * math.pi)) for a in self.angles]
-        line = encode(f"S,{clock},12000,{counts[0]},250,{counts[1]},")
+        line = encode(f"S,{clock},{self.battery},{counts[0]},250,{counts[1]},")
         return bytes(byte for byte in line if self.draw.random() >= self.loss)
+
+
+def options(*given: str) -> list[str]:
+    return ["--ros-args", *(part for one in given for part in ("-p", one))]
 
 
 @pytest.fixture
@@ -102,8 +114,10 @@ def board(tmp_path: Path) -> Iterator[Firmware]:
 def test_it_drives_through_lost_bytes_resets_and_unplugging(
     board: Firmware, node: Node, process: Callable[..., Any], eventually: Callable[..., None]
 ) -> None:
-    options = (f"device:={board.device}", "wheel_names:=[left, right]", "encoder_bits:=16")
-    driver = process("serial_driver", "--ros-args", *(a for o in options for a in ("-p", o)))
+    wheels = "wheel_names:=[left, right]"
+    driver = process(
+        "serial_driver", *options(f"device:={board.device}", wheels, "encoder_bits:=16")
+    )
     seen: list[MotorState] = []
     node.create_subscription(MotorState, "left/motor_state", seen.append, 10)
     command = node.create_publisher(MotorCommand, "left/motor_command", 10)
@@ -139,6 +153,170 @@ def test_it_drives_through_lost_bytes_resets_and_unplugging(
     settles_after(board.plug)
     # Commands cease: the driver sends zero, and the wheel stands.
     eventually(lambda: board.voltages[0] == 0.0, 3.0, node.spin, "still driven")
+
+
+@pytest.fixture
+def robot(node: Node) -> Any:
+    """What a board's two wheels report, and their commands."""
+
+    class Robot:
+        def __init__(self) -> None:
+            self.voltage = 0.0
+            self.seen: list[MotorState] = []
+            self.diagnoses: list[str] = []
+            topics = ("left/motor_command", "right/motor_command")
+            self.outputs = [node.create_publisher(MotorCommand, topic, 10) for topic in topics]
+
+        def drive(self) -> None:
+            for output in self.outputs:
+                output.publish(MotorCommand(voltage=self.voltage))
+            node.spin()
+
+    robot = Robot()
+    take = lambda m: robot.diagnoses.extend(s.message for s in m.status)  # noqa: E731
+    node.create_subscription(DiagnosticArray, "/diagnostics", take, 10)
+    node.create_subscription(MotorState, "left/motor_state", robot.seen.append, 10)
+    return robot
+
+
+# 36 V in 16 bits are -29536 mV; a divider may show anything.
+@pytest.mark.parametrize("battery", [-12000, -29536, -1, 65535, 10**17, 0, 40, ""])
+def test_no_supply_that_a_board_reports_turns_zero_into_motion(
+    board: Firmware, robot: Any, process: Any, eventually: Any, battery: int | str
+) -> None:
+    board.battery = battery
+    started = process(
+        "serial_driver", *options(f"device:={board.device}", "wheel_names:=[left, right]")
+    )
+    eventually(lambda: len(board.obeyed) > 30, 20.0, robot.drive, started.output)
+    assert board.obeyed == [[0.0, 0.0]] * len(board.obeyed)
+    robot.voltage = -3.0
+    usable = battery in (0, 40)
+    asked = [-1e-3 * battery] * 2 if usable else [-3.0, -3.0]
+    eventually(lambda: board.obeyed[-1] == asked, 20.0, robot.drive, started.output)
+    assert all(-1.0 <= state.duty_cycle <= 0.0 for state in robot.seen)
+    words = "switched off" if usable else "driving" if battery == "" else "no battery's"
+    eventually(lambda: any(words in m for m in robot.diagnoses), 5.0, robot.drive, robot.diagnoses)
+
+
+def test_a_board_that_stood_still_is_told_little_of_what_was_meant_for_then(
+    board: Firmware, robot: Any, process: Any, eventually: Any
+) -> None:
+    started = process(
+        "serial_driver", *options(f"device:={board.device}", "wheel_names:=[left, right]")
+    )
+    robot.voltage = 3.0
+    eventually(lambda: board.voltages == [3.0, 3.0], 20.0, robot.drive, started.output)
+    board.stalled, begun = True, time.monotonic()
+    eventually(lambda: time.monotonic() > begun + 2.0, 3.0, robot.drive)
+    robot.voltage = 0.0
+    eventually(lambda: time.monotonic() > begun + 2.5, 3.0, robot.drive)
+    board.obeyed.clear()
+    board.stalled = False
+    eventually(lambda: [0.0, 0.0] in board.obeyed, 20.0, robot.drive, started.output)
+    stale = board.obeyed.index([0.0, 0.0])
+    # Answers to what it reported at last, and a fifth of a second of keeping it alive.
+    assert stale <= 7
+    eventually(lambda: len(board.obeyed) > stale + 50, 20.0, robot.drive)
+    assert board.obeyed[stale:] == [[0.0, 0.0]] * (len(board.obeyed) - stale)
+
+
+def test_every_command_follows_the_clock_of_the_sample_that_it_answers(
+    board: Firmware, robot: Any, process: Any, eventually: Any
+) -> None:
+    told: list[tuple[int, float]] = []
+
+    def listen(lines: Lines, now: float) -> None:
+        clock = int((now - board.start_clock) * 1e6)
+        for line in lines.feed(os.read(board.master, 4096)):
+            if line.startswith("A,"):
+                told.append((int(line.split(",")[1].split("*")[0]), clock))
+            elif line.startswith("V,"):
+                board.obeyed.append(board.voltages)
+
+    board.listen = listen  # type: ignore[method-assign]
+    process("serial_driver", *options(f"device:={board.device}", "wheel_names:=[left, right]"))
+    eventually(lambda: len(told) > 50, 20.0, robot.drive)
+    assert abs(len(told) - len(board.obeyed)) <= 1
+    ages = sorted(1e-6 * (clock - answered) for answered, clock in told)
+    assert ages[0] > 0.0 and ages[len(ages) // 2] < 0.1
+
+
+def test_lines_that_no_board_sends_end_nothing(
+    board: Firmware, robot: Any, process: Any, eventually: Any
+) -> None:
+    started = process(
+        "serial_driver", *options(f"device:={board.device}", "wheel_names:=[left, right]")
+    )
+    eventually(lambda: len(robot.seen) > 5, 20.0, robot.drive, started.output)
+    long = "9" * 400
+    for fields in (
+        f"1,12000,{2**63},0,0,0", f"1,12000,{-(2**63) - 1},0,0,0", f"1,12000,{long},0,0,0",
+        f"{long},12000,0,0,0,0", f"1,{long},0,0,0,0", f"1,12000,0,{long},0,0",
+        "1_0,12000,0,0,0,0", " 1,12000,0,0,0,0", "1,,,,,", "", "1,12000", "1,nan,0,0,0,0",
+        f"1,12000,{10**18 - 1},0,{1 - 10**18},0",
+    ):  # fmt: skip
+        os.write(board.master, encode(f"S,{fields}"))
+    os.write(board.master, bytes(range(256)) * 16 + b"\n")
+    count = len(robot.seen)
+    eventually(lambda: len(robot.seen) > count + 20, 20.0, robot.drive, started.output)
+    assert started.returncode is None
+
+
+def test_a_device_that_is_no_terminal_is_named_and_leaks_nothing(
+    tmp_path: Path, robot: Any, process: Any, eventually: Any
+) -> None:
+    (tmp_path / "notes.txt").write_text("no terminal\n")
+    started = process("serial_driver", *options(f"device:={tmp_path / 'notes.txt'}"))
+    eventually(lambda: robot.diagnoses, 20.0, robot.drive, started.output)
+    assert "notes.txt: Inappropriate ioctl" in robot.diagnoses[-1]
+    open_files = lambda: len(os.listdir(f"/proc/{started.pid}/fd"))  # noqa: E731
+    before, reports = open_files(), len(robot.diagnoses)
+    eventually(lambda: len(robot.diagnoses) > reports + 3, 20.0, robot.drive)
+    assert open_files() <= before  # six tries later
+
+
+def test_a_device_that_another_program_has_is_left_alone(
+    board: Firmware, robot: Any, process: Any, eventually: Any
+) -> None:
+    given = options(f"device:={board.device}", "wheel_names:=[left, right]")
+    process("serial_driver", *given)
+    eventually(lambda: len(robot.seen) > 5, 20.0, robot.drive)
+    process("serial_driver", *given, "-r", "__ns:=/second")
+    eventually(
+        lambda: any("another program has it open" in m for m in robot.diagnoses),
+        20.0, robot.drive, robot.diagnoses,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("given", "words"),
+    [
+        ({"wheel_names": ("left", "left")}, "a wheel is named twice: left"),
+        ({"wheel_names": ()}, "wheel_names is empty"),
+        ({"wheel_names": ("",)}, "wheel name ''"),
+        ({"wheel_names": ("front left",)}, "wheel name 'front left'"),
+        ({"wheel_names": ("1st",)}, "wheel name '1st'"),
+        ({"wheel_names": ("a/../b",)}, "wheel name"),
+        ({"wheel_names": ("a" * 300,)}, "at most 100"),
+        ({"baud": 0}, "baud is 0"),
+        ({"baud": -9600}, "baud is -9600"),
+        ({"gear_ratio": -1.0}, "gear ratio is -1.0"),
+        ({"gear_ratio": 0.0}, "gear ratio is 0.0"),
+        ({"encoder_bits": 1}, "encoder_bits is 1"),
+    ],
+)
+def test_options_that_no_board_has_are_refused(given: dict[str, Any], words: str) -> None:
+    with pytest.raises(ParameterError, match=words):
+        Settings(**given)
+
+
+@pytest.mark.parametrize("given", ["wheel_names:=[left, left]", "supply_voltage:=-12.0"])
+def test_refused_options_are_one_line(process: Any, given: str) -> None:
+    started = process("serial_driver", *options(given))
+    assert started.wait(20.0) == 2
+    (line,) = started.output.strip().splitlines()
+    assert line.startswith("serial_driver: ")
 
 
 def test_a_line_that_was_spoilt_is_never_taken() -> None:
