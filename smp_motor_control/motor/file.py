@@ -13,15 +13,21 @@
 
 import math
 import os
-import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
+from smp_motor_control import check_wheel_names
 from smp_motor_control.encoder import Encoder
 from smp_motor_control.errors import ParameterError, check_positive
-from smp_motor_control.motor.parameters import COMBINATIONS, PHYSICAL, Gearbox, MotorParameters
+from smp_motor_control.motor.parameters import (
+    COMBINATIONS,
+    PHYSICAL,
+    Gearbox,
+    MotorParameters,
+    check_supply,
+)
 from smp_motor_control.parameter_file import read_parameters
 
 HARDWARE = {
@@ -34,7 +40,6 @@ HARDWARE = {
 """What may stand beside the motor's parameters, and what holds where it does not."""
 
 _OPTIONAL = ("coulomb_friction", "time_constant_product", "static_voltage")
-_NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*\Z")
 
 
 @dataclass(frozen=True)
@@ -123,9 +128,10 @@ def parse_motors(
 ) -> dict[str, MotorEntry]:
     """Return the motors of an already nested mapping."""
     entries = {str(name): _entry(motors[name], f"{source}: {name}") for name in motors}
-    for name in entries:
-        if not _NAME.match(name):
-            raise ParameterError(f"{source}: motor {name!r} cannot be a ROS name")
+    try:
+        check_wheel_names(list(entries))
+    except ParameterError as error:
+        raise ParameterError(f"{source}: {error}") from None
     missing = [wheel for wheel in wheels or () if wheel not in entries]
     if missing or not entries:
         have = ", ".join(entries) or "none"
@@ -157,7 +163,7 @@ def _entry(values: Any, where: str) -> MotorEntry:
 def _motor(combined: bool, numbers: dict[str, float]) -> MotorEntry:
     hardware = {key: numbers.pop(key, default) for key, default in HARDWARE.items()}
     faults: dict[str, Any] = {key: numbers.pop(key) for key in FAULTS if key in numbers}
-    check_positive("supply_voltage", hardware["supply_voltage"], "V")
+    check_supply("supply_voltage", hardware["supply_voltage"])
     check_positive("delay", hardware["delay"], "s", or_zero=True)
     bits = hardware["encoder_bits"]
     return MotorEntry(

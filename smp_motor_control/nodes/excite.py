@@ -15,7 +15,7 @@ from functools import partial
 from rclpy.node import Node
 
 from smp_interfaces.msg import MotorState
-from smp_motor_control import WHEELS
+from smp_motor_control import WHEELS, check_wheel_names
 from smp_motor_control.errors import ParameterError, SmpError
 from smp_motor_control.excitation import SIGNALS, Bounded, Excitation
 from smp_motor_control.fields import fixed
@@ -62,6 +62,8 @@ class Settings:
     def __post_init__(self) -> None:
         if self.signal not in SIGNALS:
             raise ParameterError(f"signal is {self.signal!r}; known are {', '.join(SIGNALS)}")
+        check_wheel_names(self.wheel_names)
+        check_wheel_names(self.chosen())
         if self.amplitude > self.max_voltage:
             raise ParameterError(
                 f"amplitude is {self.amplitude:g} V; it must not exceed max_voltage, "
@@ -70,7 +72,7 @@ class Settings:
         self.signal_of(0)
 
     def chosen(self) -> tuple[str, ...]:
-        return self.wheel_names if "all" in self.wheels else tuple(dict.fromkeys(self.wheels))
+        return self.wheel_names if "all" in self.wheels else self.wheels
 
     def signal_of(self, wheel: int) -> Excitation:
         """Return the bounded signal of the n-th wheel."""

@@ -134,7 +134,12 @@ def run(name: str, make: Callable[[], Node], argv: list[str] | None = None) -> i
 _USAGE_ERRORS = (
     *("RCLError", "RCLInvalidROSArgsError", "UnknownROSArgsError"),
     *("InvalidParameterTypeException", "InvalidParameterValueException"),
-    *("InvalidNodeNameException", "InvalidNamespaceException", "ParameterAlreadyDeclaredException"),
+    *(
+        "InvalidNodeNameException",
+        "InvalidNamespaceException",
+        "InvalidTopicNameException",
+        "ParameterAlreadyDeclaredException",
+    ),
 )
 
 

@@ -1,10 +1,9 @@
 """Parameters of skid_steer, named as those of diff_drive_controller where they mean the same."""
 
-import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from smp_motor_control import LEFT, RIGHT
+from smp_motor_control import LEFT, RIGHT, check_wheel_names
 from smp_motor_control.body.heading import HeadingHold
 from smp_motor_control.body.kinematics import SkidSteer
 from smp_motor_control.body.speed_limiter import SpeedLimiter
@@ -17,12 +16,7 @@ def check_wheels(left: Sequence[str], right: Sequence[str]) -> None:
     for side, names in (("left", left), ("right", right)):
         if not any(names):
             raise ParameterError(f"{side}_wheel_names is empty; a side has at least one wheel")
-    both = (*left, *right)
-    for name in both:
-        if not re.fullmatch(r"[A-Za-z][A-Za-z0-9_]*", name):
-            raise ParameterError(f"wheel name {name!r}: letters, digits and _ only, as in a topic")
-    if len(set(both)) < len(both):
-        raise ParameterError(f"a wheel is named twice in {', '.join(both)}")
+    check_wheel_names((*left, *right))
 
 
 @dataclass(frozen=True, kw_only=True)

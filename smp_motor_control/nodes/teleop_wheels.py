@@ -19,7 +19,7 @@ from geometry_msgs.msg import Twist, TwistStamped
 from rclpy.node import Node
 from sensor_msgs.msg import JointState
 
-from smp_motor_control import WHEELS, joint_of
+from smp_motor_control import WHEELS, check_wheel_names, joint_of
 from smp_motor_control.errors import ParameterError, SmpError
 from smp_motor_control.fields import fixed, nested
 from smp_motor_control.keyboard import Keyboard, Speeds, keys_of
@@ -139,6 +139,7 @@ class Settings:
     def __post_init__(self) -> None:
         if not 1 <= len(self.wheel_names) <= 9:
             raise ParameterError(f"wheel_names has {len(self.wheel_names)} names; 1 to 9 have keys")
+        check_wheel_names(self.wheel_names)
 
 
 class TeleopWheels(Node):

@@ -15,6 +15,8 @@ from sensor_msgs.msg import BatteryState
 
 from smp_interfaces.msg import MotorDescription, MotorState
 from smp_motor_control.encoder import Unwrapper
+from smp_motor_control.errors import ParameterError
+from smp_motor_control.motor.parameters import check_supply
 from smp_motor_control.nodes.motor_writer import MotorWriter
 from smp_motor_control.nodes.robot_client import RobotClient, RobotError
 from smp_motor_control.nodes.runtime import LATCHED, seconds
@@ -120,10 +122,12 @@ def descriptions(
 
 
 def battery(client: RobotClient) -> float:
-    """Return what ``battery_state`` says [V]; NaN where nobody publishes it."""
+    """Return what ``battery_state`` says [V]; NaN where nobody does, or it is no supply's."""
     if not client.node.count_publishers("battery_state"):
         return math.nan
     heard: list[float] = []
     with client.listen(BatteryState, {"battery_state": lambda m: heard.append(m.voltage)}):
         client.until(lambda: bool(heard), 1.0)
-    return heard[-1] if heard else math.nan
+    with contextlib.suppress(ParameterError):
+        return check_supply("battery_state.voltage", heard[-1] if heard else math.nan)
+    return math.nan

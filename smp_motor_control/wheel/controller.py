@@ -11,9 +11,9 @@ from statistics import median
 from typing import Protocol
 
 from smp_motor_control.encoder import Encoder
-from smp_motor_control.errors import ParameterError, check_positive
+from smp_motor_control.errors import ParameterError, check_range
 from smp_motor_control.fields import described, nested
-from smp_motor_control.motor.parameters import Gearbox
+from smp_motor_control.motor.parameters import Gearbox, check_supply
 from smp_motor_control.pid import PidOutput
 from smp_motor_control.wheel.acceptance import Circumstances, check
 from smp_motor_control.wheel.faults import Fault, FaultDetector, FaultLimits, Recovery
@@ -123,7 +123,9 @@ class WheelController:
         self, gearbox: Gearbox, encoder: Encoder, supply: float, resistance: float = math.nan
     ) -> None:
         """Learn what is between motor and wheel."""
-        check_positive("supply_voltage", supply, "V")
+        check_supply("supply_voltage", supply)
+        if not math.isnan(resistance):
+            check_range("resistance", resistance, 1e-6, 1e6, "ohm")
         self.settings.loop.within(supply)
         self.supply = supply
         self.loop.set_hardware(gearbox, encoder, 1.5 * supply)

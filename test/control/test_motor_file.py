@@ -73,7 +73,7 @@ def test_names_with_dots_are_the_same_as_nesting(tmp_path):
         (("encoder_bits: 16", "encoder_bits: 70"), "encoder_bits"),
         (("encoder_bits: 16", "encoder_bits: 7.5"), "encoder_bits"),
         (("gear_ratio: 65.5", "gear_ratio: 0"), "gear ratio"),
-        (("front_left", "front left"), "cannot be a ROS name"),
+        (("front_left", "front left"), "wheel name 'front left'"),
         (("motors:", "engines:"), "has no motors"),
         (("{", "["), "is not YAML"),
     ],

@@ -280,8 +280,14 @@ def test_supply_limits_the_voltage_and_hardware_without_one_is_refused():
     world.wheel.set_hardware(Gearbox(65.5), Encoder(), 5.0)
     world.run(1.0)
     assert max(abs(voltage) for _, voltage, _ in world.log) <= 5.0
-    with pytest.raises(ValueError, match="supply_voltage"):
-        world.wheel.set_hardware(Gearbox(65.5), Encoder(), 0.0)
+    for supply in (0.0, -12.0, 1e-3, 1e6, math.inf, math.nan):
+        with pytest.raises(ValueError, match="supply_voltage"):
+            world.wheel.set_hardware(Gearbox(65.5), Encoder(), supply)
+    for resistance in (0.0, -1.0, 1e9, math.inf):
+        with pytest.raises(ValueError, match="resistance"):
+            world.wheel.set_hardware(Gearbox(65.5), Encoder(), 12.0, resistance)
+    world.run(1.0)
+    assert max(abs(voltage) for _, voltage, _ in world.log) <= 5.0
 
 
 def test_gains_that_suit_no_such_feedback_are_named_once_its_rate_is_known():

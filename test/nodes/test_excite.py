@@ -8,12 +8,30 @@ from collections.abc import Iterator
 import pytest
 from wheel_robot import WheelRobot
 
+from smp_motor_control.errors import ParameterError
+from smp_motor_control.nodes.excite import Settings
+
 
 @pytest.fixture
 def robot(ros_domain: int) -> Iterator[WheelRobot]:
     robot = WheelRobot(ros_domain)
     yield robot
     robot.close()
+
+
+@pytest.mark.parametrize(
+    ("given", "words"),
+    [
+        ({"wheel_names": ("left", "left")}, "named twice: left"),
+        ({"wheels": ("left", "left")}, "named twice: left"),
+        ({"wheels": ("front left",)}, "wheel name 'front left'"),
+        ({"wheels": ("",)}, "wheel name ''"),
+        ({"wheel_names": ("all/", "b")}, "wheel name 'all/'"),
+    ],
+)
+def test_wheels_that_have_no_topics_are_refused(given, words):
+    with pytest.raises(ParameterError, match=words):
+        Settings(**given)
 
 
 def test_excite_is_bounded_ends_by_itself_and_ends_at_zero(process, robot, eventually):
