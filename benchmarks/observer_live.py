@@ -45,6 +45,7 @@ def parameters(entry: MotorEntry, rate: float, source: str) -> list[str]:
         "feedforward_velocity": p.a0 * ratio,
         "antiwindup_strategy": "conditional_integration",
         "max_acceleration": 0.5,
+        "stop_time": 10.0,
         "speed_source": source,
         "difference_window": 1,
         "model.dc_gain": 1.01 * p.dc_gain,

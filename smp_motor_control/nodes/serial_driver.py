@@ -60,7 +60,7 @@ class Settings:
     resistance: float = described(math.nan, "Of a motor, by ohmmeter [ohm]; NaN: not measured.")
     command_timeout: float = described(
         0.2, "Silence of a wheel's commands after which it gets 0 V [s].", minimum=0.02,
-        maximum=2.0,
+        maximum=5.0,
     )  # fmt: skip
 
     def __post_init__(self) -> None:

@@ -18,6 +18,7 @@ _LEVELS = {
     State.INACTIVE: runtime.OK,
     State.TIMED_OUT: runtime.WARN,
     State.NOT_OURS: runtime.WARN,
+    State.ROLLING: runtime.WARN,
 }
 _TERMS = ("p_term", "i_term", "d_term", "feedforward", "unsaturated")
 UNTUNED = (
@@ -68,8 +69,14 @@ class WheelReport:
         if fault is not None and wheel.state is not State.INACTIVE:
             ending = "; latched: call ~/reset" if wheel.recovery.latched else ""
             return runtime.ERROR, fault.value + ending
-        owner = f" ({wheel.owner})" if wheel.state is State.NOT_OURS else ""
-        return _LEVELS.get(wheel.state, runtime.ERROR), wheel.state.value + owner
+        more = f" ({wheel.owner})" if wheel.state is State.NOT_OURS else ""
+        if wheel.state is State.NO_FEEDBACK and wheel.clock.gap:
+            more = (
+                f"; motor_state came {wheel.clock.gap:.3g} s after the one before, and "
+                f"feedback_timeout is {wheel.settings.feedback_timeout:g} s: raise it for feedback "
+                "that is so slow"
+            )
+        return _LEVELS.get(wheel.state, runtime.ERROR), wheel.state.value + more
 
     def _assess(self) -> tuple[bytes, str, Mapping[str, object]]:
         level, message = self._state()

@@ -2,7 +2,9 @@
 
 The loop is built from the settings and run for some hundred samples on the linear model of the
 motor, as the hardware shows it: the voltage acts one sample late, and the speed is the mean over
-a sample.  First without clamps, where an unstable loop grows; then as it would drive.
+a sample.  First without clamps, where an unstable loop grows; then as it would drive.  Whatever
+the motor, its clamps let the output be zero, and the reference stands ``stop_time`` after a
+set-point of zero.
 """
 
 import math
@@ -16,7 +18,7 @@ from smp_motor_control.motor.model import MotorModel
 from smp_motor_control.motor.parameters import Gearbox
 from smp_motor_control.motor.response import zero_order_hold
 from smp_motor_control.pid import PidGains
-from smp_motor_control.reference.profile import UNLIMITED
+from smp_motor_control.reference.profile import UNLIMITED, Profile
 from smp_motor_control.wheel.loop import LEARNING, LoopSettings, WheelLoop
 
 RATES = (0.001, 0.002, 0.005, 0.01)
@@ -31,6 +33,9 @@ thousandth of what any encoder resolves; of i, the same per millisecond."""
 
 GROSS = 2.0
 """Speed in set-points that no stable loop reaches: an undamped one of second order swings to 2."""
+
+USUAL_SUPPLY = 12.0
+"""What drives a wheel whose supply and clamps are not known [V]."""
 
 _UNKNOWN = Encoder(2.0**20)
 """An encoder that is not known yet speaks against no gains: they may be for a fine one."""
@@ -71,6 +76,7 @@ def check(settings: LoopSettings, wheel: Circumstances | None = None) -> None:
     model, ratio = known or (_NOMINAL, _NOMINAL_RATIO)
     given = wheel.sample_time
     intervals = RATES if math.isnan(given) else (min(max(given, 1e-4), 1.0),)
+    _check_stop(settings, model.dc_gain / ratio, intervals[0])
     try:
         with np.errstate(all="ignore"):
             plants = [_Plant(model, ratio, dt) for dt in intervals]
@@ -101,6 +107,45 @@ def _check_signs(gains: PidGains) -> None:
                 f"{name} is {value:g}; it must be in [{least:g}, {largest:g}], "
                 f"and is beyond by {beyond:g}"
             )
+
+
+def _check_stop(settings: LoopSettings, speed_per_volt: float, dt: float) -> None:
+    """Refuse clamps that leave no zero, and a reference that stands later than ``stop_time``."""
+    gains, limits, drive = settings.gains, settings.limits, settings.drive
+    low, high = gains.u_clamp_min, gains.u_clamp_max
+    if not low <= 0.0 <= high:
+        raise ParameterError(
+            f"u_clamp_min is {low:g} V and u_clamp_max {high:g} V, so that the wheel is driven at "
+            "a set-point of zero; the first must not be above zero, the second not below"
+        )
+    speed = min(limits.velocity, max(high, -low) * speed_per_volt)
+    if drive is not None:
+        speed = min(speed, drive.top_speed)
+    elif not math.isfinite(speed):
+        speed = min(limits.velocity, USUAL_SUPPLY * speed_per_volt)
+    try:
+        profile = Profile(limits, settings.transition_time, drive)
+        profile.reset(speed)
+        profile.set_target(0.0, dt)
+    except ArithmeticError as error:
+        raise ParameterError(f"no reference can be computed with these limits: {error}") from error
+    lag = settings.reference_delay + settings.reference_doubt
+    taken, allowed = profile.duration + lag, settings.stop_time
+    if taken > allowed + 0.5 * dt:
+        times = {
+            "transition_time": settings.transition_time,
+            "max_acceleration": limits.acceleration if math.isfinite(limits.acceleration) else 0.0,
+            "max_jerk": limits.jerk if math.isfinite(limits.jerk) else 0.0,
+            "drive.time_constant": 0.0 if drive is None else drive.time_constant,
+            "reference_delay": settings.reference_delay,
+            "reference_doubt": settings.reference_doubt,
+        }
+        given = ", ".join(f"{name} {value:g}" for name, value in times.items() if value)
+        raise ParameterError(
+            f"{given}: a wheel at {speed:.3g} rad/s stands {taken:.3g} s after a set-point of "
+            f"zero, and stop_time is {allowed:g} s; let it stop faster, or give stop_time what "
+            "you can wait for"
+        )
 
 
 def _model_at_wheel(
@@ -220,7 +265,7 @@ def _swing(settings: LoopSettings, plant: _Plant, wheel: Circumstances) -> float
     loop = WheelLoop(settings, Gearbox(plant.ratio), encoder, 1.5 * wheel.supply)
     plant.rest()
     dt = plant.dt
-    most = min(settings.gains.u_clamp_max, -settings.gains.u_clamp_min, 12.0)
+    most = min(settings.gains.u_clamp_max, -settings.gains.u_clamp_min, USUAL_SUPPLY)
     target = max(0.2 * plant.final * max(most - plant.static, 0.0), 1e-9)
     target = min(target, settings.limits.velocity or math.inf)
     speed = voltage = fastest = 0.0

@@ -19,13 +19,13 @@ from smp_motor_control.wheel.acceptance import Circumstances, check
 from smp_motor_control.wheel.faults import Fault, FaultDetector, FaultLimits, Recovery
 from smp_motor_control.wheel.freshness import FeedbackClock, Verdict
 from smp_motor_control.wheel.loop import LoopSettings, WheelLoop
+from smp_motor_control.wheel.stop import AT_REST, STANDING, StopRule
 
 _LARGEST_SETPOINT = 1e4
 _LEARNING = 20
 _EVIDENCE = 0.1
 """Of a longer gap between samples no more counts against the wheel [s]: the driver may have
 switched off by its own time-out meanwhile."""
-_AT_REST = 0.05
 _STANDS = PidOutput(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, False)
 _FRESH, _FIRST, _LATE = Verdict.FRESH, Verdict.FIRST, Verdict.LATE
 
@@ -41,6 +41,7 @@ class State(Enum):
     LATE_FEEDBACK = "feedback is late: 0 V"
     BAD_FEEDBACK = "feedback is not a number or implausible: left out"
     NOT_OURS = "not yours: another node drives this wheel: 0 V"
+    ROLLING = "rolls at 0 V: a wheel that was at fault is not braked until it is asked to turn"
     FAULT = "fault: 0 V"
 
 
@@ -158,6 +159,7 @@ class WheelController:
         self._setpoint_at = -math.inf
         self._feedback_at = now
         self._late_at = self._bad_at = -math.inf
+        self._stop = StopRule()
         self._expired = False
         self._resume = True
         self.output = 0.0
@@ -175,6 +177,7 @@ class WheelController:
         else:
             self.setpoint = value
             self._setpoint_at = now
+            self._stop.ask(value, now)
 
     def take_feedback(self, sample: Sample, stamp: int, arrival: int, now: float) -> float | None:
         """Take in a sample, stamped and arrived at [ns]; return its answer [V] or None."""
@@ -270,7 +273,7 @@ class WheelController:
             if setpoint == 0.0 and not self.owner:  # obeyed, without the loop
                 self.loop.reference = self.loop.reference._replace(velocity=0.0)
                 self.answer, self.target, self.measurement = _STANDS, 0.0, measurement
-            return self._zero(self._idle(setpoint))
+            return self._zero(self._idle(setpoint, measurement))
         loop, detector = self.loop, self._detector
         if self._resume:
             self._resume = False
@@ -278,9 +281,12 @@ class WheelController:
             detector.reset()
             self.output = 0.0
         evidence = dt if dt < _EVIDENCE else _EVIDENCE
-        fault = detector.step(evidence, self.output, measurement, current)
+        stands = self._stop.asked and loop.reference.velocity == 0.0
+        fault = detector.step(evidence, self.output, measurement, current, stands=stands)
         if fault is not None:
             return self._trip(fault, now)
+        if self._stop.asked:
+            self._end_drive(evidence, measurement, now)
         out = loop.step(setpoint, measurement, dt)
         voltage = out.output
         if voltage - voltage != 0.0:
@@ -299,11 +305,28 @@ class WheelController:
         self.state = State.TIMED_OUT if self._expired else State.DRIVING
         return voltage
 
-    def _idle(self, setpoint: float | None) -> State:
+    def _end_drive(self, dt: float, measurement: float, now: float) -> None:
+        """Take away what still drives a wheel that was asked to stand long enough ago."""
+        loop = self.loop
+        overdue = self._stop.overdue(now, self.settings.loop.stop_time)
+        if abs(loop.reference.velocity) > STANDING:
+            driven = self.output * measurement > 0.0 and abs(measurement) > AT_REST
+            if overdue:
+                loop.halt()
+        else:
+            driven = self._stop.is_driven(dt, self.output, measurement)
+        if overdue and driven:
+            loop.pid.reset()
+            self._stop.watch()
+            self.refuse("integral that drove the wheel past stop_time")
+
+    def _idle(self, setpoint: float | None, measurement: float) -> State:
         """Return why a wheel without a fault is left at zero."""
         if setpoint is None:
             return State.WAITING if self._setpoint_at == -math.inf else State.TIMED_OUT
-        return State.NOT_OURS if self.owner else State.DRIVING
+        if self.owner:
+            return State.NOT_OURS
+        return State.ROLLING if abs(measurement) > AT_REST else State.DRIVING
 
     def _present_setpoint(self, measurement: float, now: float) -> float | None:
         """Return what the wheel is to do now; None when it is to be left alone."""
@@ -314,8 +337,9 @@ class WheelController:
         self._expired = silent > 0.0
         if not self._expired:
             return self.setpoint
-        stopped = self.loop.reference.velocity == 0.0 and abs(measurement) < _AT_REST
-        if stopped or silent > 1.0 + 2.0 * settings.loop.transition_time:
+        self._stop.ask(0.0, now - silent)
+        stopped = self.loop.reference.velocity == 0.0 and abs(measurement) < AT_REST
+        if stopped or self._stop.overdue(now, settings.loop.stop_time):
             self.setpoint = None
             return None
         return 0.0

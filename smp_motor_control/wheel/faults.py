@@ -97,8 +97,10 @@ class FaultDetector:
         self._wrong_speed = 0.0
         self._begin_window(math.nan)
 
-    def step(self, dt: float, voltage: float, velocity: float, current: float) -> Fault | None:
-        """Take in one sample."""
+    def step(
+        self, dt: float, voltage: float, velocity: float, current: float, *, stands: bool = False
+    ) -> Fault | None:
+        """Take in one sample, of a wheel whose reference is zero where it ``stands``."""
         limits = self.limits
         if limits.current_limit > 0.0 and abs(current) > limits.current_limit:
             self._hot += dt
@@ -113,12 +115,14 @@ class FaultDetector:
                 return self._no_motion(voltage, current)
         else:
             self._still = 0.0
-        return self._runaway(dt, voltage, velocity)
+        # A slope makes a wheel creep until the voltage holds it.
+        slowest = max(self.limits.stall_velocity, _SLOWEST if stands else 0.0)
+        return self._runaway(dt, voltage, velocity, slowest)
 
-    def _runaway(self, dt: float, voltage: float, velocity: float) -> Fault | None:
-        """Braking turns against the voltage too, but it slows down."""
+    def _runaway(self, dt: float, voltage: float, velocity: float, slowest: float) -> Fault | None:
+        """Return a fault where a wheel turns against its voltage and, unlike a braked one, on."""
         limits = self.limits
-        against = voltage * velocity < 0.0 and abs(velocity) >= limits.stall_velocity
+        against = voltage * velocity < 0.0 and abs(velocity) >= slowest
         if not against or abs(voltage) < 0.5 * limits.stall_voltage:
             self._wrong = 0.0
             return None

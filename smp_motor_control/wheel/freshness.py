@@ -39,6 +39,7 @@ class FeedbackClock:
         self.jumps = 0  # of the stamps' clock
         self.offset = 0.0  # learnt difference of the clocks [s]
         self.dt = 0.0  # interval that ends with the last fresh sample [s]
+        self.gap = 0.0  # interval that was too long, where the last sample came after one [s]
         self.age = 0.0  # from stamp to arrival of the last sample, less the offset [s]
         self._last: int | None = None
         self._heard = -math.inf
@@ -77,7 +78,8 @@ class FeedbackClock:
         self._last = stamp
         if age > self.max_age:
             return Verdict.LATE
-        if last is None or step > self.max_gap:
+        self.gap = step if step > self.max_gap else 0.0
+        if last is None or self.gap:
             return Verdict.FIRST
         self.dt = step
         return Verdict.FRESH

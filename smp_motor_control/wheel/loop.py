@@ -25,6 +25,9 @@ SPEED_SOURCES = ("measured", "difference", "observer")
 LONGEST_TRANSITION = 60.0
 """Largest duration of a change of set-point [s]."""
 
+LONGEST_STOP = 10.0
+"""Largest time in which a wheel is to stand [s]."""
+
 LEARNING = 20
 """Samples from which the observer learns the usual interval."""
 
@@ -38,6 +41,10 @@ class LoopSettings:
     transition_time: float = described(
         0.0, "Duration of every change of set-point [s]; 0: as fast as limits allow.",
         minimum=0.0, maximum=LONGEST_TRANSITION,
+    )  # fmt: skip
+    stop_time: float = described(
+        1.0, "Time after a set-point of zero, or after the last one's time-out, at which nothing "
+        "drives the wheel any more [s].", minimum=0.05, maximum=LONGEST_STOP,
     )  # fmt: skip
     # The error is taken from the reference of that long ago, so that a wheel that does what its
     # model says is left alone; 0: from the present one.
@@ -246,6 +253,11 @@ class WheelLoop:
         self.pid.reset()
         self._path.start(measurement)
         self._standstill = Standstill()
+
+    def halt(self) -> None:
+        """Ask for a standstill at once, wherever the reference is on its way there."""
+        self._path.start(0.0)
+        self.reference = self.profile.now
 
     def step(self, setpoint: float, measurement: float, dt: float) -> PidOutput:
         """Advance reference and controller by one sample; a wheel that stands is left alone."""

@@ -22,7 +22,7 @@ from smp_motor_ident.tune.curves import curves
 from smp_motor_ident.tune.exports import FORMATS, export
 from smp_motor_ident.tune.source import choose_source
 from smp_motor_ident.tune.wheels import WheelSet
-from smp_motor_ident.tune.writing import gains_document, gains_yaml, parameters
+from smp_motor_ident.tune.writing import gains_document, gains_yaml, parameters, slow_loop
 
 DEFAULT_RATE = 200.0  # steps per second where neither the user nor the identification says [Hz]
 SOURCES, COMPARISON, DESIGN = 1.0, 3.0, 2.0
@@ -296,7 +296,7 @@ def show(wheels: WheelSet) -> None:
     for wheel, design in wheels.designs.items():
         print(f"{wheel}: {design.settling.describe()}")
         print(f"{wheel}: {design.reason}")
-        for warning in design.warnings:
+        for warning in (*design.warnings, *slow_loop(design)):
             print(f"{wheel}: warning: {warning}")
 
 
@@ -313,5 +313,6 @@ def provenance(
         sources = ", ".join(estimates[wheel].sources) or "unknown"
         lines.append(f"{wheel}: {estimates[wheel].model} model from {sources}")
         lines += [f"  {design.reason}", f"  {design.settling.describe()}"]
-        lines.extend(f"  warning: {warning}" for warning in design.warnings)
+        told = (*design.warnings, *slow_loop(design))
+        lines.extend(f"  warning: {warning}" for warning in told)
     return lines

@@ -6,17 +6,23 @@ import math
 from collections.abc import Iterable, Mapping
 from typing import Any
 
+from smp_motor_control.errors import ParameterError
+from smp_motor_control.motor.hardware import DriveSettings
 from smp_motor_control.motor.model import MotorModel
 from smp_motor_control.parameter_file import written
 from smp_motor_control.wheel.controller import WheelSettings
 from smp_motor_control.wheel.differenced import differenced_gains
 from smp_motor_control.wheel.faults import FaultLimits
+from smp_motor_control.wheel.loop import LONGEST_STOP, LoopSettings
 from smp_motor_ident.result import plain
 from smp_motor_ident.tune.designer import Design
 from smp_motor_ident.tune.limits import JUMP
 from smp_motor_ident.tune.loop import Loop
 
 SCHEMA = 1
+
+RESERVE = 1.25
+"""Share by which a reference may take longer to stand than computed: from full speed, at rest."""
 
 
 def parameters(design: Design) -> dict[str, Any]:
@@ -38,7 +44,43 @@ def parameters(design: Design) -> dict[str, Any]:
         "model": {name: float(value) for name, value in design.motor.items()},
         **_plausible(reference.drive.top_speed, design.loop),
         **_must_turn(design.breakaway),
+        **_patience(design),
     }
+
+
+def _patience(design: Design) -> dict[str, float]:
+    """Return the times of the stop rule and of lost feedback where the usual ones are too short."""
+    reference, times = design.wheel_reference, {}
+    profile, sample_time = reference.profile(), design.loop.sample_time
+    profile.reset(float(reference.max_velocity))
+    profile.set_target(0.0, sample_time)
+    stop = RESERVE * (profile.duration + reference.lag + reference.doubt)
+    if stop > LONGEST_STOP:
+        raise ParameterError(
+            f"a wheel that is sampled every {sample_time:.3g} s would stand {stop:.3g} s after a "
+            f"set-point of zero, and wheel_pid takes at most {LONGEST_STOP:g} s; sample it faster"
+        )
+    if stop > LoopSettings().stop_time:
+        times["stop_time"] = stop
+    if silence(design.loop) > WheelSettings().feedback_timeout:
+        times["feedback_timeout"] = silence(design.loop)
+    return times
+
+
+def silence(loop: Loop) -> float:
+    """Return the silence that a loop must bear: that of two samples lost, and a late one [s]."""
+    return 3.5 * loop.sample_time
+
+
+def slow_loop(design: Design) -> list[str]:
+    """Return what the hardware's driver must do for a loop that answers seldom."""
+    needed, interval = silence(design.loop), design.loop.sample_time
+    if needed <= DriveSettings().command_timeout:
+        return []
+    return [
+        f"a command comes every {1e3 * interval:.3g} ms: the hardware's driver must hold it for "
+        f"{needed:.3g} s (command_timeout), or the wheel falls back to 0 V between two commands"
+    ]
 
 
 def _window(design: Design) -> int:

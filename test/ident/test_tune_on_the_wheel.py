@@ -4,16 +4,21 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from wheel_simulation import Timing, simulate_closed_loop
 
+from smp_motor_control.fields import parameters_in
+from smp_motor_control.fields import settings_of as settings_of_parameters
 from smp_motor_control.motor.file import load_motors
-from smp_motor_control.motor.hardware import DriveSettings
+from smp_motor_control.motor.hardware import DrivenMotor, DriveSettings
 from smp_motor_control.motor.model import MotorModel
+from smp_motor_control.parameter_file import flat
 from smp_motor_control.reference.profile import ProfileLimits, Reference
 from smp_motor_control.reference.time_optimal import VoltageLimited
+from smp_motor_control.wheel.controller import State, WheelController, WheelSettings
 from smp_motor_control.wheel.loop import LoopSettings, WheelLoop
 from smp_motor_ident.cli.tuning import read_estimates
 from smp_motor_ident.tune import Loop, design, design_wheels
@@ -22,6 +27,7 @@ from smp_motor_ident.tune.motors import motors_of
 from smp_motor_ident.tune.plant import sample
 from smp_motor_ident.tune.reference import planned_change
 from smp_motor_ident.tune.simulation import Controller, Inputs, simulate
+from smp_motor_ident.tune.writing import parameters, silence, slow_loop
 
 MOTORS = Path(__file__).resolve().parents[2] / "config" / "motors_paper.yaml"
 STEP = 1.2
@@ -146,3 +152,39 @@ def test_a_reversal_turns_the_friction_voltage_in_time(estimates):
         )
         # 0.9 % of the change for the slowest winding; turned with the delayed reference, 2.2 %.
         assert run.velocity.min() > -2.0 - 0.013 * 3.0
+
+
+@pytest.mark.parametrize("rate", [1.0, 2.0, 4.0, 5.0, 10.0, 20.0])
+def test_gains_for_a_slow_loop_drive_its_wheel(estimates, rate):
+    T, entry = 1 / rate, load_motors(MOTORS)["front_left"]
+    one = design(estimates["front_left"], Loop(sample_time=T))
+    written = flat(parameters(one))
+    values = {name: field.default for name, field in parameters_in(WheelSettings).items()}
+    settings = settings_of_parameters(WheelSettings, {**values, **written})
+    wheel = WheelController(WheelSettings())
+    wheel.check(settings)
+    wheel.configure(settings)
+    wheel.set_hardware(entry.gearbox, entry.encoder, entry.supply_voltage)
+    held = DriveSettings(command_timeout=silence(one.loop), latch=True)
+    plant = DrivenMotor(entry, held, start=100.0)
+    wheel.activate(100.0)
+    speeds, target, begun = [], 0.5 * one.wheel_reference.max_velocity, 0
+    for k in range(1, 80):
+        now = 100.0 + k * T
+        if k % 7 == 3:
+            continue  # a sample is lost now and then
+        sample = plant.sample(now)
+        wheel.take_setpoint(target, now)
+        late = now + 0.05 * T
+        wheel.tick(late)
+        stamp = round(1e9 * now)
+        answer = wheel.take_feedback(
+            SimpleNamespace(**sample._asdict()), stamp, stamp + round(5e7 * T), late
+        )
+        if answer is not None:
+            plant.command(late, answer)
+        begun += wheel.state is State.DRIVING
+        speeds.append(sample.velocity)
+    assert begun > 55
+    assert np.mean(speeds[-20:]) == pytest.approx(target, rel=0.1)
+    assert bool(slow_loop(one)) is (silence(one.loop) > 0.2)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from types import SimpleNamespace
 
 import pytest
@@ -16,7 +17,9 @@ from smp_motor_control.wheel.loop import LoopSettings
 def said(monkeypatch):
     """Return the log and the assessment of a wheel with these gains."""
 
-    def ask(gains: PidGains) -> tuple[list[str], bytes, str]:
+    def ask(
+        gains: PidGains, put: Callable[[WheelController], object] = lambda wheel: None
+    ) -> tuple[list[str], bytes, str]:
         assessments, log = [], []
         diagnostics = lambda node, assess, joint: (  # noqa: E731
             assessments.append(assess) or SimpleNamespace(due=False, publish=lambda: None)
@@ -25,6 +28,7 @@ def said(monkeypatch):
         node = SimpleNamespace(get_logger=lambda: SimpleNamespace(warning=log.append))
         wheel = WheelController(WheelSettings(loop=LoopSettings(gains=gains)))
         wheel_report.WheelReport(node, wheel, "left_wheel_joint")
+        put(wheel)
         level, message, _ = assessments[0]()
         return log, level, message
 
@@ -43,3 +47,19 @@ def test_a_wheel_with_gains_says_nothing_of_them(said):
     assert log == []
     assert "gains" not in message
     assert "defaults" not in message
+
+
+def test_feedback_that_is_slower_than_its_time_out_is_named_with_both(said):
+    def feed(wheel: WheelController) -> None:
+        wheel.activate(100.0)
+        for k in range(1, 5):
+            now = 100.0 + 0.25 * k
+            wheel.tick(now)
+            state = SimpleNamespace(voltage=0.0, current=0.0, velocity=0.0, encoder_count=0)
+            wheel.take_feedback(state, round(1e9 * now), round(1e9 * now), now)
+
+    _, level, message = said(PidGains(p=2.0), feed)
+    assert level == runtime.ERROR
+    assert "came 0.25 s after the one before, and feedback_timeout is 0.2 s" in message
+    _, _, message = said(PidGains(p=2.0), lambda wheel: wheel.activate(0.0) or wheel.tick(9.0))
+    assert message.startswith("no feedback: 0 V") and "feedback_timeout" not in message

@@ -1,0 +1,224 @@
+"""A wheel stands within ``stop_time`` of a zero set-point or of silence, whatever its settings."""
+
+from __future__ import annotations
+
+import math
+import random
+from dataclasses import replace
+
+import pytest
+from wheel_world import DT, GAIN, GAINS, SETPOINT_TIMEOUT, SETTINGS, SUPPLY, TAU, World, silent
+
+from smp_motor_control.errors import ParameterError
+from smp_motor_control.motor.model import MotorModel
+from smp_motor_control.motor.parameters import Gearbox
+from smp_motor_control.pid import PidGains
+from smp_motor_control.reference.profile import Drive, ProfileLimits
+from smp_motor_control.wheel.acceptance import Circumstances, check
+from smp_motor_control.wheel.controller import State, WheelSettings
+from smp_motor_control.wheel.loop import LoopSettings
+from smp_motor_control.wheel.stop import AT_REST, STANDING, WINDOW
+
+UNHURRIED = {
+    "drive": {"drive": Drive(top_speed=3.0, time_constant=1e5)},
+    "delay": {"reference_delay": 10.0},
+    "doubt": {"reference_delay": 0.1, "reference_doubt": 1.0},
+    "transition": {"transition_time": 60.0},
+    "acceleration": {"limits": ProfileLimits(acceleration=0.01)},
+    "jerk": {"limits": ProfileLimits(jerk=0.01)},
+}
+"""Settings that lead a wheel to a standstill in more than a second."""
+
+
+def settings(gains: PidGains = GAINS, stop_time: float = 1.0, **loop: object) -> WheelSettings:
+    return replace(SETTINGS, loop=LoopSettings(gains=gains, stop_time=stop_time, **loop))
+
+
+def driving(world: World, speed: float = 1.5) -> World:
+    """Turn a wheel at a speed, its reference with it, however slowly that would get there."""
+    world.setpoint = speed
+    world.run(0.1)
+    world.speed = speed
+    world.wheel.loop.start(speed)
+    return world.run(1.0)
+
+
+@pytest.mark.parametrize("stop_time", [0.5, 1.0])
+@pytest.mark.parametrize("name", UNHURRIED)
+def test_a_reference_that_is_led_too_slowly_ends_at_the_stop_time(name, stop_time):
+    world = driving(World(settings(stop_time=stop_time, **UNHURRIED[name])))
+    assert world.speed > 1.0
+    world.setpoint = 0.0
+    # Then the reference is zero, and what is left is the loop's own response to that.
+    world.run(stop_time + 2 * DT)
+    assert world.wheel.loop.reference.velocity == 0.0 and world.held <= 0.0
+    world.run(8 * TAU)
+    assert abs(world.speed) < AT_REST and world.wheel.loop.reference.velocity == 0.0
+    world.run(10.0)
+    assert abs(world.speed) < AT_REST and world.wheel.state is State.DRIVING
+
+
+@pytest.mark.parametrize("name", UNHURRIED)
+def test_silence_ends_in_0_v_after_its_time_out_and_the_stop_time(name):
+    world = driving(World(settings(**UNHURRIED[name])))
+    silent(world)
+    world.run(SETPOINT_TIMEOUT + 1.0 + 2 * DT)
+    assert world.held == 0.0 and world.wheel.setpoint is None
+    world.run(6 * TAU)
+    assert abs(world.speed) < AT_REST
+
+
+@pytest.mark.parametrize(
+    "gains",
+    [
+        replace(GAINS, p=0.0, i=0.05),
+        replace(GAINS, p=0.0, i=20.0, error_deadband=1e3),
+        replace(GAINS, p=0.01, i=1e-6),
+    ],
+)
+def test_an_integral_that_would_drive_on_is_dropped(gains):
+    blind = replace(SETTINGS.faults, tracking_time=0.0)
+    world = World(replace(settings(), faults=blind)).run(2.0)
+    # Changed without a jump: the integral takes over what the other terms gave.
+    world.wheel.configure(replace(settings(gains), faults=blind))
+    world.run(0.2)
+    assert world.speed == pytest.approx(1.5, rel=0.1)
+    world.setpoint = 0.0
+    world.run(1.0 + WINDOW + 2 * DT + 6 * TAU)
+    assert abs(world.speed) < AT_REST
+    (why,) = world.wheel.refused
+    assert "integral" in why and world.wheel.state is State.DRIVING
+
+
+def test_a_slope_is_held_and_a_hand_that_pushes_is_no_drive():
+    world = World().run(2.0)
+    world.load = 3.0
+    world.setpoint = 0.0
+    world.run(10.0)
+    assert world.held == pytest.approx(-3.0, abs=0.1) and abs(world.speed) < AT_REST
+    world.load = 3.8
+    world.run(3.0)
+    assert world.held == pytest.approx(-3.8, abs=0.1)
+    assert not world.wheel.refused and world.wheel.state is State.DRIVING
+    assert max(abs(speed) for _, _, speed in world.log[-100:]) < AT_REST
+
+
+def test_a_wheel_that_rolls_after_a_fault_does_not_say_that_it_is_driven():
+    world = World().run(2.0)
+    world.blocked = True
+    world.until(lambda: world.wheel.recovery.fault is not None, 1.5)
+    world.blocked, world.load, world.setpoint = False, 3.0, 0.0
+    world.until(lambda: world.wheel.recovery.fault is None, 2.0)
+    world.run(0.5)
+    assert world.held == 0.0 and world.wheel.state is State.ROLLING
+    world.load = 0.0
+    world.run(1.0)
+    assert world.wheel.state is State.DRIVING
+
+
+def test_what_a_joystick_leaves_in_its_middle_asks_for_a_standstill():
+    world = driving(World(settings(**UNHURRIED["transition"])))
+    for k in range(round(1.2 / DT)):
+        world.setpoint = (0.0, 0.9 * STANDING, -0.9 * STANDING)[k % 3]
+        world.step()
+    world.run(6 * TAU)
+    assert abs(world.speed) < AT_REST
+
+
+def test_a_slow_set_point_is_none_of_zero():
+    world = World().run(2.0)
+    world.setpoint = 0.1
+    world.run(5.0)
+    assert world.speed == pytest.approx(0.1, rel=0.01)
+
+
+@pytest.mark.parametrize("name", UNHURRIED)
+def test_settings_that_stand_too_late_are_refused_with_what_they_take(name):
+    with pytest.raises(ParameterError, match=r"stands .* s after a set-point of zero, and stop_"):
+        check(settings(**UNHURRIED[name]).loop)
+
+
+@pytest.mark.parametrize("name", ["transition_time", "reference_delay"])
+def test_settings_are_taken_up_to_the_stop_time(name):
+    check(settings(**{name: 1.0}).loop)
+    with pytest.raises(ParameterError, match=f"{name} 1.002"):
+        check(settings(**{name: 1.002}).loop)
+    check(settings(stop_time=1.1, **{name: 1.002}).loop)
+
+
+def test_the_speed_that_is_braked_from_is_the_fastest_that_is_known():
+    model = MotorModel(dc_gain=GAIN * 65.5, time_constant=TAU)
+    known = Circumstances(sample_time=DT, supply=SUPPLY, gearbox=Gearbox(65.5))
+    loop = LoopSettings(gains=GAINS, model=model)
+    top = GAIN * SUPPLY  # 4.32 rad/s
+    check(replace(loop, limits=ProfileLimits(acceleration=1.02 * top)), known)
+    with pytest.raises(ParameterError, match=f"a wheel at {top:.3g} rad/s stands 1.02 s"):
+        check(replace(loop, limits=ProfileLimits(acceleration=0.98 * top)), known)
+    check(replace(loop, limits=ProfileLimits(acceleration=0.6, velocity=0.5)), known)
+    with pytest.raises(ParameterError, match=r"max_acceleration 0\.4: a wheel at 0\.5 rad/s"):
+        check(replace(loop, limits=ProfileLimits(acceleration=0.4, velocity=0.5)), known)
+    drive = Drive(top_speed=2.0, time_constant=1.4)  # from 2 rad/s: 1.4 s ln 2
+    check(replace(loop, drive=drive), known)
+    with pytest.raises(ParameterError, match=r"drive.time_constant 1\.5: a wheel at 2 rad/s"):
+        check(replace(loop, drive=replace(drive, time_constant=1.5)), known)
+
+
+@pytest.mark.parametrize(("low", "high"), [(1.0, 12.0), (-12.0, -1e-3), (5e-324, math.inf)])
+def test_clamps_that_leave_no_zero_are_refused(low, high):
+    clamped = replace(GAINS, u_clamp_min=low, u_clamp_max=high)
+    with pytest.raises(ParameterError, match="driven at a set-point of zero"):
+        check(LoopSettings(gains=clamped))
+    check(LoopSettings(gains=replace(GAINS, u_clamp_min=0.0)))
+    check(LoopSettings(gains=replace(GAINS, u_clamp_max=0.0)))
+
+
+@pytest.mark.parametrize("value", [0.04, 0.0, -1.0, 10.1, math.inf, math.nan])
+def test_the_stop_time_is_a_second_or_so(value):
+    with pytest.raises(ParameterError, match="stop_time"):
+        LoopSettings(stop_time=value)
+
+
+def test_a_stop_begins_again_after_a_reset():
+    world = World().run(1.0)
+    world.setpoint = 0.0
+    world.run(5.0)
+    world.wheel.reset(world.now)
+    world.setpoint = 1.5
+    world.run(1.0)
+    assert world.speed == pytest.approx(1.5, rel=0.05)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_whatever_is_accepted_stands_in_time(seed):
+    draw = random.Random(seed)
+    model = MotorModel(dc_gain=GAIN * 65.5, time_constant=TAU)
+    known = Circumstances(sample_time=DT, supply=SUPPLY, gearbox=Gearbox(65.5))
+    stood = 0
+    for _ in range(60):
+        gains = replace(GAINS, p=10 ** draw.uniform(-2, 1), i=10 ** draw.uniform(-4, 2))
+        loop = LoopSettings(
+            gains=gains,
+            model=model,
+            limits=ProfileLimits(
+                acceleration=draw.choice([math.inf, 10 ** draw.uniform(-2, 2)]),
+                jerk=draw.choice([math.inf, 10 ** draw.uniform(-1, 4)]),
+            ),
+            transition_time=draw.choice([0.0, 10 ** draw.uniform(-2, 1)]),
+            reference_delay=draw.choice([0.0, 10 ** draw.uniform(-3, 1)]),
+            drive=draw.choice([
+                None, Drive(top_speed=3.0, time_constant=10 ** draw.uniform(-2, 5))
+            ]),
+            stop_time=draw.choice([0.2, 1.0, 3.0]),
+        )  # fmt: skip
+        try:
+            check(loop, known)
+        except ParameterError:
+            continue
+        world = World(replace(settings(), loop=loop)).run(3.0)
+        world.setpoint = 0.0
+        # A window to see that an integral drives, and the motor's own time to come to rest.
+        world.run(loop.stop_time + WINDOW + 10 * TAU)
+        last = [abs(speed) for _, _, speed in world.log[-round(0.2 / DT) :]]
+        assert max(last) < max(AT_REST, 0.1), loop
+        stood += 1
+    assert stood > 10
