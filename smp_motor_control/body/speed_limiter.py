@@ -31,7 +31,7 @@ class SpeedLimiter:
     Raises
     ------
     ParameterError
-        When a minimum is above its maximum.
+        When a pair does not enclose zero: a body with such limits cannot be stopped.
 
     References
     ----------
@@ -120,8 +120,11 @@ def _pair(name: str, lower: float | None, upper: float | None) -> tuple[float, f
         return None
     if lower is None or math.isnan(lower):
         lower = -upper
-    if lower > upper:
-        raise ParameterError(f"minimum of the {name} is {lower}, above its maximum {upper}")
+    if not lower <= 0.0 <= upper:
+        raise ParameterError(
+            f"minimum of the {name} is {lower} and its maximum {upper}; they must enclose zero, or "
+            "the body could not stand"
+        )
     # Infinity times a time step of 0 would be NaN.
     return max(lower, -sys.float_info.max), min(upper, sys.float_info.max)
 

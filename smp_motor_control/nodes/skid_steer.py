@@ -17,6 +17,7 @@ from smp_motor_control.nodes import runtime
 from smp_motor_control.nodes.odometry_output import OdometryOutput
 from smp_motor_control.nodes.settings import Parameters
 from smp_motor_control.nodes.skid_steer_settings import Settings
+from smp_motor_control.wheel.stop import StopRule
 
 IMPLAUSIBLE = 4.0
 """Wheels that seem to turn this many times faster than they can have had their counter reset."""
@@ -38,6 +39,7 @@ class SkidSteerNode(Node):
         settings = self._current.settings
         robot = settings.robot
         self._command = BodyCommand()
+        self._stop = StopRule()
         self._left, self._right = settings.left_wheel_names, settings.right_wheel_names
         size = settings.velocity_rolling_window_size
         window = size / settings.publish_rate
@@ -171,18 +173,25 @@ class SkidSteerNode(Node):
 
     def _drive(self, asked: tuple[float, float], dt: float, now: float) -> None:
         """Limit what is asked, hold the heading, and set the wheels."""
-        (v0, w0), (v1, w1) = self._given
-        linear = self._linear.limit(asked[0], v0, v1, dt).value
-        angular = self._angular.limit(asked[1], w0, w1, dt).value
+        linear, angular = self._limit(asked, dt, now)
         share = self._robot.reachable_share(linear, angular)
         linear, angular = linear * share, angular * share
-        self._given = [(linear, angular), (v0, w0)]
+        self._given = [(linear, angular), self._given[0]]
         corrected = self._hold_heading(linear, angular, dt, now)
         left, right = self._robot.reachable_wheel_speeds(linear, corrected)
         self._share = share
         self._setpoint.header.stamp = self.get_clock().now().to_msg()
         self._setpoint.velocity = [left] * len(self._left) + [right] * len(self._right)
         self._setpoints.publish(self._setpoint)
+
+    def _limit(self, asked: tuple[float, float], dt: float, now: float) -> tuple[float, float]:
+        """Return the command within the limits of acceleration and jerk, and of the stop rule."""
+        self._stop.ask(max(map(abs, asked)), now)
+        if self._stop.overdue(now, self._current.settings.stop_time):
+            return 0.0, 0.0
+        (v0, w0), (v1, w1) = self._given
+        linear = self._linear.limit(asked[0], v0, v1, dt).value
+        return linear, self._angular.limit(asked[1], w0, w1, dt).value
 
     def _hold_heading(self, linear: float, angular: float, dt: float, now: float) -> float:
         settings = self._current.settings
@@ -232,6 +241,9 @@ class SkidSteerNode(Node):
             problems.append((runtime.WARN, text))
         if commanded and self._command.timed_out(now) and any(self._given[0]):
             problems.append((runtime.WARN, "cmd_vel timed out, braking"))
+        if commanded and not settings.cmd_vel_timeout:
+            text = "cmd_vel_timeout is 0: the body drives on when cmd_vel ceases"
+            problems.append((runtime.WARN, text))
         if settings.heading_hold and now - self._yaw_time > settings.imu_timeout:
             problems.append((runtime.WARN, "heading is not held: no imu"))
         return problems

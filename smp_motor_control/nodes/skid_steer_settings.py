@@ -9,6 +9,7 @@ from smp_motor_control.body.kinematics import SkidSteer
 from smp_motor_control.body.speed_limiter import SpeedLimiter
 from smp_motor_control.errors import ParameterError
 from smp_motor_control.fields import described, fixed, nested
+from smp_motor_control.wheel.stop import LONGEST_STOP
 
 
 def check_wheels(left: Sequence[str], right: Sequence[str]) -> None:
@@ -34,6 +35,10 @@ class Settings:
     cmd_vel_timeout: float = described(
         0.5, "Age of a command at which the body brakes [s]; 0: never.", minimum=0.0
     )
+    stop_time: float = described(
+        1.0, "Time after a command of zero, or after the last one's time-out, at which the wheels "
+        "are asked to stand whatever the limits [s].", minimum=0.05, maximum=LONGEST_STOP,
+    )  # fmt: skip
     use_stamped_vel: bool = fixed(
         True, "Which of two publishers is followed: TwistStamped (true) or Twist (false)."
     )

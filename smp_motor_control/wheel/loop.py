@@ -19,14 +19,12 @@ from smp_motor_control.reference.profile import Drive, Profile, ProfileLimits, R
 from smp_motor_control.wheel.differenced import differenced_gains
 from smp_motor_control.wheel.plausibility import PlausibleSpeed
 from smp_motor_control.wheel.standstill import Standstill
+from smp_motor_control.wheel.stop import LONGEST_STOP
 
 SPEED_SOURCES = ("measured", "difference", "observer")
 
 LONGEST_TRANSITION = 60.0
 """Largest duration of a change of set-point [s]."""
-
-LONGEST_STOP = 10.0
-"""Largest time in which a wheel is to stand [s]."""
 
 LEARNING = 20
 """Samples from which the observer learns the usual interval."""

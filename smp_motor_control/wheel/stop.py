@@ -15,6 +15,9 @@ STANDING = 1e-3
 AT_REST = 0.05
 """Speed up to which a wheel stands [rad/s]."""
 
+LONGEST_STOP = 10.0
+"""Largest time in which a wheel is to stand [s]."""
+
 WINDOW = 0.5
 """Time over which voltage and speed are averaged to tell who turns a wheel [s]: a few counts of a
 coarse encoder at the speed at which a wheel stands."""

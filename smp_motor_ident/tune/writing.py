@@ -13,7 +13,8 @@ from smp_motor_control.parameter_file import written
 from smp_motor_control.wheel.controller import WheelSettings
 from smp_motor_control.wheel.differenced import differenced_gains
 from smp_motor_control.wheel.faults import FaultLimits
-from smp_motor_control.wheel.loop import LONGEST_STOP, LoopSettings
+from smp_motor_control.wheel.loop import LoopSettings
+from smp_motor_control.wheel.stop import LONGEST_STOP
 from smp_motor_ident.result import plain
 from smp_motor_ident.tune.designer import Design
 from smp_motor_ident.tune.limits import JUMP

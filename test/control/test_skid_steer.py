@@ -67,6 +67,23 @@ def test_limiter_lets_nothing_through_that_is_not_finite(bad: float) -> None:
         SpeedLimiter(max_velocity=1.0).limit(bad, 0.0, 0.0, 0.1)
 
 
+@pytest.mark.parametrize(
+    "limits",
+    [
+        {"min_velocity": 0.1, "max_velocity": 1.0},
+        {"min_velocity": -1.0, "max_velocity": -0.1},
+        {"max_acceleration": 1.0, "max_deceleration": 0.5},
+        {"max_acceleration": 1.0, "max_deceleration_reverse": -0.5},
+        {"max_acceleration": -1.0},
+        {"max_acceleration": 1.0, "max_acceleration_reverse": 1.0},
+        {"min_jerk": 0.1, "max_jerk": 1.0},
+    ],
+)
+def test_limits_with_which_a_body_cannot_stand_are_refused(limits: dict[str, float]) -> None:
+    with pytest.raises(ParameterError, match="enclose zero"):
+        SpeedLimiter(**limits)
+
+
 def make_odometry(**more: float) -> Odometry:
     return Odometry(wheel_separation=0.5, left_radius=0.1, right_radius=0.1, **more)
 

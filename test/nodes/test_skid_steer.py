@@ -102,6 +102,29 @@ def test_another_type_that_is_published_too_is_named(skid_steer, peer, process, 
     assert peer.drives(5.0, 5.0)
 
 
+@pytest.mark.parametrize(
+    "limit", ["linear.x.max_acceleration:=0.01", "linear.x.max_jerk:=0.01", "stop_time:=0.3"]
+)
+def test_a_body_stands_in_its_stop_time_whatever_its_limits(
+    skid_steer, peer, eventually, limit
+) -> None:
+    """A command of 0.5 m/s that it reached without limits, then zero under the limit."""
+    skid_steer()
+    repeatedly(peer, lambda: peer.command(0.5), lambda: peer.drives(5.0, 5.0), eventually)
+    name, value = limit.split(":=")
+    peer.command(0.5)
+    assert peer.set(name, float(value)) == (True, "")
+    peer.setpoints.clear()
+    asked = peer.node.get_clock().now().nanoseconds * 1e-9
+    repeatedly(peer, lambda: peer.command(0.0), lambda: peer.drives(0.0, 0.0), eventually)
+    first = next(m for m in peer.setpoints if not any(m.velocity))
+    taken = first.header.stamp.sec + 1e-9 * first.header.stamp.nanosec - asked
+    assert taken < 1.2
+    peer.setpoints.clear()
+    repeatedly(peer, lambda: peer.command(1e-4), lambda: len(peer.setpoints) > 20, eventually)
+    assert peer.drives(0.0, 0.0) or name == "stop_time"
+
+
 def test_parameters_change_while_driving_and_nonsense_is_refused_with_its_reason(
     skid_steer, peer, eventually
 ) -> None:
