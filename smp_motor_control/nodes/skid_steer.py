@@ -234,6 +234,9 @@ class SkidSteerNode(Node):
                 for wheel, age in silent.items()
             )
             problems.append((runtime.ERROR, f"no feedback from {wheels}"))
+        told = "; ".join(f"{wheel}: {what}" for wheel, what in self._feedback.problems.items())
+        if told and not settings.open_loop:
+            problems.append((runtime.WARN, told))
         if now - self._refused_at < REPORTED:
             problems.append((runtime.WARN, f"cmd_vel {self._refused}"))
         if self._unheard:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 import pytest
 
@@ -42,15 +43,16 @@ def test_first_reading_is_no_motion() -> None:
 
 
 def test_wheel_that_falls_silent_leaves_the_mean_and_comes_back_without_a_jump() -> None:
-    feedback = make()
+    feedback, total = make(), 0.0
     for k in range(100):
         feed(feedback, 0.1 * k, "acd", 0.1 * k)
         if not 20 <= k < 60:
             feed(feedback, 0.1 * k, "b", 0.1 * k)
         travel = feedback.take(0.1 * k, TIMEOUT)
         if k > 0 and not 20 <= k <= 26:
-            assert travel.left == pytest.approx(0.1 if k != 60 else 0.05)
-    assert feedback.silent(9.9, TIMEOUT) == {}
+            assert travel.left == pytest.approx(0.1)
+        total += 0.0 if travel is None else travel.left
+    assert feedback.silent(9.9, TIMEOUT) == {} and total == pytest.approx(9.9)
 
 
 def test_silence_of_a_whole_side_is_told_and_not_guessed() -> None:
@@ -110,3 +112,137 @@ def test_sample_without_a_number_is_no_sign_of_life() -> None:
     feed(feedback, 0.0, "abcd", 0.0)
     feed(feedback, 1.0, "abcd", math.nan, math.inf)
     assert set(feedback.silent(1.0, TIMEOUT)) == {"a", "b", "c", "d"}
+
+
+RATE, MOST = 200, 11.6
+"""Samples a second, and the fastest that a wheel is believed to turn [rad/s]."""
+
+
+def drive(
+    see: Callable[[str, float, WheelSample], WheelSample | None],
+    seconds: float = 6.0,
+    ways: Callable[[str, float], float] = lambda wheel, t: (1.0 if wheel in "ab" else 2.0) * t,
+    wheels: tuple[str, str] = ("ab", "cd"),
+) -> tuple[float, float, WheelFeedback]:
+    """Drive 2 s on after ``seconds`` with a fault; return the ways of the sides [rad]."""
+    feedback = WheelFeedback(*wheels, max_speed=MOST)
+    left = right = 0.0
+    for k in range(round((seconds + 2.0) * RATE) + 1):
+        t = k / RATE
+        for wheel in "".join(wheels):
+            way = ways(wheel, t)
+            velocity = (ways(wheel, t + 1e-6) - way) * 1e6
+            sample = WheelSample(1e4 + t, way, velocity)
+            seen = see(wheel, t, sample) if t < seconds else sample
+            if seen is not None:
+                feedback.receive(wheel, seen, t)
+        if k % 4 == 0 and (travel := feedback.take(t, TIMEOUT)) is not None:
+            left, right = left + travel.left, right + travel.right
+    return left, right, feedback
+
+
+@pytest.mark.parametrize("silence", [0.3, 0.8, 4.0])
+@pytest.mark.parametrize("silent", ["a", "ab", "abcd", "ac"])
+@pytest.mark.parametrize("wheels", [("ab", "cd"), ("a", "c")])
+def test_positions_tell_the_way_of_a_silence(silence: float, silent: str, wheels) -> None:
+    def see(wheel: str, t: float, sample: WheelSample) -> WheelSample | None:
+        return None if wheel in silent and 1.0 < t < 1.0 + silence else sample
+
+    left, right, feedback = drive(see, wheels=wheels)
+    assert (left, right) == pytest.approx((8.0, 16.0), abs=0.01)
+    assert not feedback.problems
+
+
+def test_a_wheel_that_is_silent_for_ever_is_taken_to_turn_as_its_side_does() -> None:
+    left, right, _ = drive(lambda wheel, t, s: None if wheel == "a" else s, seconds=6.0)
+    assert (left, right) == pytest.approx((8.0, 16.0), abs=0.01)
+
+
+@pytest.mark.parametrize("spike", [3.0, -50.0, 1e9, -1e300, math.nan])
+def test_position_spikes_cost_no_way(spike: float) -> None:
+    def see(wheel: str, t: float, sample: WheelSample) -> WheelSample:
+        spoilt = wheel == "a" and round(t * RATE) % 50 == 17
+        return sample._replace(position=sample.position + spike) if spoilt else sample
+
+    left, right, feedback = drive(see)
+    # A position that is no number is bridged by the velocity, and the next one makes it good.
+    assert (left, right) == pytest.approx((8.0, 16.0), abs=0.01)
+    assert not feedback.problems
+
+
+def test_a_counter_that_is_reset_costs_less_than_a_sample() -> None:
+    def see(wheel: str, t: float, sample: WheelSample) -> WheelSample:
+        return sample._replace(position=sample.position - 40.0) if t > 3.0 else sample
+
+    left, right, feedback = drive(lambda w, t, s: see(w, t, s) if w == "a" else s, seconds=8.0)
+    assert (left, right) == pytest.approx((10.0, 20.0), abs=0.01)
+    assert "position jumped" in feedback.problems["a"]
+
+
+def test_a_publisher_that_restarted_counts_from_elsewhere() -> None:
+    feedback = WheelFeedback(("a",), ("c",), max_speed=MOST)
+    for t, position, restarted in ((0.0, 100.0, False), (0.1, 100.2, False), (30.0, 0.0, True),
+                                   (30.1, 0.3, False)):  # fmt: skip
+        for wheel in "ac":
+            feedback.receive(wheel, WheelSample(t, position, 2.0), t, restarted)
+        travel = feedback.take(t, TIMEOUT)
+    assert travel is not None and travel.left == pytest.approx(0.3)
+
+
+@pytest.mark.parametrize("lowest", [0.0, -math.pi])
+@pytest.mark.parametrize("speed", [1.0, -5.0])
+def test_a_position_that_wraps_is_named_and_costs_nothing(lowest: float, speed: float) -> None:
+    def see(wheel: str, t: float, sample: WheelSample) -> WheelSample:
+        return sample._replace(position=(sample.position - lowest) % (2 * math.pi) + lowest)
+
+    left, right, feedback = drive(see, seconds=8.0, ways=lambda wheel, t: speed * min(t, 7.9))
+    # The last way, back to the true position, is a jump of whole turns.
+    assert (left, right) == pytest.approx((7.9 * speed, 7.9 * speed), abs=0.05)
+    assert "position wraps" in feedback.problems["a"]
+
+
+def test_a_position_that_wraps_elsewhere_costs_no_more_than_the_velocity_tells() -> None:
+    def see(wheel: str, t: float, sample: WheelSample) -> WheelSample:
+        return sample._replace(position=sample.position % 3.7)
+
+    left, right, feedback = drive(see, seconds=8.0, ways=lambda wheel, t: 2.0 * min(t, 7.9))
+    assert (left, right) == pytest.approx((15.8, 15.8), abs=0.05)
+    assert "position jumped" in feedback.problems["c"]
+
+
+def test_a_position_that_is_never_filled_is_named_and_the_velocity_tells_the_way() -> None:
+    def see(wheel: str, t: float, sample: WheelSample) -> WheelSample:
+        return sample._replace(position=0.0)
+
+    left, right, feedback = drive(see, seconds=8.0, ways=lambda wheel, t: 2.0 * min(t, 7.9))
+    assert (left, right) == pytest.approx((15.8, 15.8), abs=0.05)
+    feedback = make()
+    for k in range(RATE):
+        feed(feedback, k / RATE, "abcd", 0.0, velocity=2.0)
+    assert set(feedback.problems) == set("abcd")
+    assert "never changes" in feedback.problems["a"]
+    speeds = feedback.take(1.0, TIMEOUT)
+    assert speeds is not None and speeds.left_speed == 2.0
+    still, _, feedback = drive(see, ways=lambda wheel, t: 0.01 * math.sin(9.0 * t))
+    assert abs(still) < 0.02 and not feedback.problems, "a wheel that stands is not blamed"
+
+
+def test_late_and_repeated_samples_are_no_motion_and_lose_none() -> None:
+    late: dict[str, WheelSample] = {}
+
+    def see(wheel: str, t: float, sample: WheelSample) -> WheelSample:
+        before = late.get(wheel, sample)
+        late[wheel] = sample
+        return before if round(t * RATE) % 10 == 3 else sample
+
+    left, right, feedback = drive(see)
+    assert (left, right) == pytest.approx((8.0, 16.0), abs=0.01)
+    assert not feedback.problems
+
+
+def test_a_clock_that_is_set_back_costs_one_sample() -> None:
+    def see(wheel: str, t: float, sample: WheelSample) -> WheelSample:
+        return sample._replace(stamp=sample.stamp - 3600.0) if t > 3.0 else sample
+
+    left, right, _ = drive(see, seconds=8.0)
+    assert (left, right) == pytest.approx((10.0, 20.0), abs=0.05)

@@ -67,7 +67,7 @@ def test_odometry_has_no_spikes_after_stalls(skid_steer, peer, eventually) -> No
 
 
 def test_odometry_follows_the_wheels_from_any_first_position(skid_steer, peer, eventually) -> None:
-    skid_steer("-p", "feedback_timeout:=60.0")  # travel while nothing was heard is left out
+    skid_steer("-p", "feedback_timeout:=60.0")
     # Wheels that start at 1000 and 2000 rad, and then roll 1 rad: 0.1 m.
     repeatedly(
         peer,
