@@ -78,6 +78,18 @@ class WheelReport:
             )
         return _LEVELS.get(wheel.state, runtime.ERROR), wheel.state.value + more
 
+    def _swing(self) -> str:
+        """Return what is to be said of a wheel that swings around its set-point."""
+        wheel, found = self._wheel, self._wheel.oscillation.found
+        if found is None or wheel.state is not State.DRIVING:
+            return ""
+        rate = 1.0 / wheel.clock.dt if wheel.clock.dt else 0.0
+        return (
+            f"the speed swings by {found.amplitude:.2g} rad/s around {wheel.target:.2g} rad/s at "
+            f"{found.frequency:.2g} Hz: the gains are too high for feedback at {rate:.0f} Hz; "
+            f"halve p, i and d, or design them by tune --rate {rate:.0f}"
+        )
+
     def _assess(self) -> tuple[bytes, str, Mapping[str, object]]:
         level, message = self._state()
         totals = self._totals()
@@ -86,7 +98,7 @@ class WheelReport:
         if listed:
             message = f"{message}; in the last second: {listed}"
             level = max(level, runtime.WARN)
-        advice = [self._wheel.advice] if self._wheel.advice else []
+        advice = [text for text in (self._wheel.advice, self._swing()) if text]
         if advice:
             level = max(level, runtime.WARN)
         if untuned(self._wheel.settings.loop.gains):

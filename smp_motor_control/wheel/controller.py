@@ -19,6 +19,7 @@ from smp_motor_control.wheel.acceptance import Circumstances, check
 from smp_motor_control.wheel.faults import Fault, FaultDetector, FaultLimits, Recovery
 from smp_motor_control.wheel.freshness import FeedbackClock, Verdict
 from smp_motor_control.wheel.loop import LoopSettings, WheelLoop
+from smp_motor_control.wheel.oscillation import Oscillation
 from smp_motor_control.wheel.stop import AT_REST, STANDING, StopRule
 
 _LARGEST_SETPOINT = 1e4
@@ -96,6 +97,7 @@ class WheelController:
         self.target = self.measurement = 0.0  # of that answer [rad/s, wheel]
         self.supply = math.inf
         self._detector = FaultDetector(settings.faults)
+        self.oscillation = Oscillation()
         self.configure(settings)
         self._forget(-math.inf)
 
@@ -133,6 +135,7 @@ class WheelController:
         self._wheel = replace(self._wheel, supply=supply, gearbox=gearbox, encoder=encoder)
         self.configure(self.settings)
         self._detector.resistance = resistance
+        self.oscillation.set_count(gearbox.to_wheel(encoder.angle_per_count))
 
     # Life ----------------------------------------------------------------------------------
 
@@ -279,6 +282,7 @@ class WheelController:
             self._resume = False
             loop.start(measurement)
             detector.reset()
+            self.oscillation.reset()
             self.output = 0.0
         evidence = dt if dt < _EVIDENCE else _EVIDENCE
         stands = self._stop.asked and loop.reference.velocity == 0.0
@@ -299,6 +303,7 @@ class WheelController:
         fault = detector.follow(evidence, reference, measurement, voltage, saturated)
         if fault is not None:
             return self._trip(fault, now)
+        self.oscillation.add(evidence, reference, measurement)
         self.output, self.answer = voltage, out
         self.target, self.measurement = setpoint, measurement
         self.steps += 1

@@ -168,7 +168,12 @@ class WheelLoop:
     def speed(self, dt: float, velocity: float, count: int, voltage: float) -> float:
         """Return the wheel's speed after one more sample, NaN where it is not known or jumps."""
         speed = self._speed_of(dt, velocity, count, voltage)
-        if speed != speed or self._plausible.accepts(speed, dt, voltage, self._one_count(dt)):
+        if speed != speed:
+            return speed
+        resolution = self._one_count(dt)
+        # Counts that jump beyond what is plausible are left out without knowing the motor.
+        asked = self.profile.target if self.source == "measured" else math.inf
+        if self._plausible.accepts(speed, dt, voltage, resolution, asked):
             return speed
         self.jumps += 1
         self._restart()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from types import SimpleNamespace
 
@@ -63,3 +64,19 @@ def test_feedback_that_is_slower_than_its_time_out_is_named_with_both(said):
     assert "came 0.25 s after the one before, and feedback_timeout is 0.2 s" in message
     _, _, message = said(PidGains(p=2.0), lambda wheel: wheel.activate(0.0) or wheel.tick(9.0))
     assert message.startswith("no feedback: 0 V") and "feedback_timeout" not in message
+
+
+def test_a_swing_is_named_with_advice(said):
+    def swing(wheel: WheelController) -> None:
+        wheel.activate(100.0)
+        for k in range(1, 401):
+            now = 100.0 + 0.02 * k
+            wheel.take_setpoint(1.5, now)
+            speed = 1.5 + 0.9 * math.sin(40.0 * 0.02 * k)
+            state = SimpleNamespace(voltage=0.0, current=0.0, velocity=speed, encoder_count=k)
+            wheel.take_feedback(state, round(1e9 * now), round(1e9 * now), now)
+
+    _, level, message = said(PidGains(p=2.0), swing)
+    assert level == runtime.WARN
+    assert "swings by 0.88 rad/s around 1.5 rad/s at 6.3 Hz" in message
+    assert "feedback at 50 Hz; halve p, i and d, or design them by tune --rate 50" in message
