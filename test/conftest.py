@@ -19,6 +19,7 @@ import pytest
 
 # Imported before numpy: as the executables do, tests leave linear algebra one thread.
 import smp_motor_control.entry  # noqa: F401
+from smp_motor_control.nodes import loopback
 
 # Examples are drawn alike in every run, and may take their time on a busy machine.
 hypothesis.settings.register_profile("suite", derandomize=True, deadline=None)
@@ -89,7 +90,8 @@ def ros_domain(monkeypatch: pytest.MonkeyPatch) -> Iterator[int]:
     """Give the test, and every process that it starts, a ROS domain of its own on loopback."""
     domain, handle = claim_domain()
     monkeypatch.setenv("ROS_DOMAIN_ID", str(domain))
-    monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+    for name, value in loopback.environment().items():
+        monkeypatch.setenv(name, value)
     monkeypatch.delenv("ROS_STATIC_PEERS", raising=False)
     with handle:
         yield domain

@@ -85,13 +85,18 @@ class MotorEntry:
 
 
 def paper_motors() -> Path:
-    """Return the file of the paper's motors, from the installation or from the sources."""
+    """Return the file of the paper's motors."""
+    return shared("motors_paper.yaml")
+
+
+def shared(name: str) -> Path:
+    """Return a file of ``config``, from the installation or from the sources."""
     prefixes = os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep)
     shares = [Path(prefix, "share", "smp_motor_control") for prefix in prefixes if prefix]
     for place in (*shares, Path(__file__).resolve().parents[2]):
-        if (path := place / "config" / "motors_paper.yaml").is_file():
+        if (path := place / "config" / name).is_file():
             return path
-    raise ParameterError("config/motors_paper.yaml is not installed; build smp_motor_control again")
+    raise ParameterError(f"config/{name} is not installed; build smp_motor_control again")
 
 
 def load_motors(path: str | Path, wheels: Iterable[str] | None = None) -> dict[str, MotorEntry]:

@@ -11,6 +11,7 @@ from typing import Any
 
 from smp_motor_control import LEFT, RIGHT, WHEELS, controller_of
 from smp_motor_control.motor.file import load_motors, paper_motors
+from smp_motor_control.nodes import loopback
 from smp_motor_ident.cli import demo, driving, plan, steps, verdict
 from smp_motor_ident.cli.processes import Processes, connect, free_domain
 from smp_motor_ident.cli.workers import die_with_parent
@@ -51,7 +52,7 @@ def work(arguments: argparse.Namespace) -> int:
     truth = load_motors(motors, WHEELS)
     folder = _fresh(Path(arguments.output))
     domain = free_domain() if arguments.domain is None else arguments.domain
-    os.environ.update(ROS_DOMAIN_ID=str(domain), ROS_AUTOMATIC_DISCOVERY_RANGE="LOCALHOST")
+    os.environ.update({"ROS_DOMAIN_ID": str(domain), **loopback.environment()})
     with Processes(folder / "logs") as processes, connect(demo.NAME) as client:
         robot = start(steps.Robot(processes, client, WHEELS, folder), motors, arguments.rate)
         say(f"running: motor_plant, {len(WHEELS)} wheel_pid, skid_steer (ROS domain {domain})")

@@ -109,5 +109,9 @@ def test_the_wheels_may_do_alike_and_few_may_command_them() -> None:
             p for p, rule in rules.items() if f"/{wheel}/wheel_pid/change_state" in rule["request"]
         }
         assert askers == {"/commission", "/tune", "/robot_guard"}
+        resetting = {
+            p for p, rule in rules.items() if f"/{wheel}/wheel_pid/reset" in rule["request"]
+        }
+        assert resetting == {"/operator"}, "a latched wheel waits for a person"
     assert publishers("/wheel_setpoints") == {"/skid_steer", "/teleop_wheels", "/commission"}
     assert publishers("/cmd_vel") == {"/teleop_wheels"}

@@ -25,7 +25,8 @@ def test_every_started_process_is_ended_with_its_children(process, eventually):
 
 
 def test_each_process_inherits_a_domain_of_its_own_on_loopback(process, ros_domain):
-    shown = process("sh", "-c", "echo $ROS_DOMAIN_ID $ROS_AUTOMATIC_DISCOVERY_RANGE")
+    shown = process("sh", "-c", "echo $ROS_DOMAIN_ID $FASTRTPS_DEFAULT_PROFILES_FILE")
     assert shown.wait(5.0) == 0
-    assert shown.output.split() == [str(ros_domain), "LOCALHOST"]
+    domain, profile = shown.output.split()
+    assert (domain, Path(profile).name) == (str(ros_domain), "loopback.xml")
     assert os.environ["ROS_DOMAIN_ID"] == str(ros_domain)
