@@ -8,7 +8,10 @@ LONGEST = 1.0
 """Of a lease whose wheel's commands never expire [s]."""
 
 MOST_WRITERS = 64
-"""Whose clocks are kept; more are no robot's."""
+"""That are known at a time, by their clocks and their refusals; more are no robot's."""
+
+OTHERS = "others"
+"""Under which refused commands of still more writers are counted."""
 
 
 class Lease:
@@ -51,7 +54,9 @@ class Lease:
         """
         late = self._is_late(writer, now, stamp, arrival)
         if writer != self._owner and now < self._until:
-            self.refused[writer] = self.refused.get(writer, 0) + 1
+            known = writer in self.refused or len(self.refused) < MOST_WRITERS
+            name = writer if known else OTHERS
+            self.refused[name] = self.refused.get(name, 0) + 1
             return False
         if late and voltage != 0.0:
             self.late += 1
@@ -61,11 +66,11 @@ class Lease:
         return True
 
     def _is_late(self, writer: str, now: float, stamp: int, arrival: int) -> bool:
-        clock = self._clocks.get(writer)
-        if clock is None:
-            if len(self._clocks) >= MOST_WRITERS:
-                self._clocks.clear()
-            clock = self._clocks[writer] = FeedbackClock(self._expire, math.inf)
+        clocks = self._clocks
+        clock = clocks.pop(writer, None) or FeedbackClock(self._expire, math.inf)
+        clocks[writer] = clock  # the last one to be forgotten
+        if len(clocks) > MOST_WRITERS:
+            del clocks[next(iter(clocks))]
         return clock.accept(stamp, arrival, now) is Verdict.LATE
 
     def owner(self, now: float) -> str:

@@ -151,6 +151,26 @@ def test_heading_hold_straightens_a_body_that_drifts() -> None:
     assert command == pytest.approx(-0.1, abs=1e-3)
 
 
+def test_a_speed_that_is_to_be_held_is_held_whatever_the_jerk() -> None:
+    limiter = SpeedLimiter(max_jerk=1.0)
+    assert limiter.limit_jerk(1.0, v0=1.0, v1=0.5, dt=0.1).value == 1.0
+    assert limiter.limit_jerk(1.1, v0=1.0, v1=0.9, dt=0.1).value == pytest.approx(1.1)
+    assert limiter.limit_jerk(1.2, v0=1.0, v1=0.9, dt=0.1).value == pytest.approx(1.11)
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_a_saturated_heading_integral_unwinds_as_soon_as_the_error_turns(sign: float) -> None:
+    hold = HeadingHold(p=0.0, i=2.0, max_correction=0.5, max_error=3.0)
+    hold.step(0.0, yaw=0.0, dt=0.05)
+    for _ in range(100):
+        saturated = hold.step(0.0, yaw=-0.4 * sign, dt=0.05)
+    assert saturated == 0.5 * sign
+    after = [hold.step(0.0, yaw=0.4 * sign, dt=0.05) for _ in range(40)]
+    # It has grown no further than to its limit and a step, 0.04, which takes two steps back.
+    assert after[2] * sign < 0.5
+    assert after[-1] == -0.5 * sign, "and winds up the other way"
+
+
 def test_heading_hold_follows_a_commanded_turn_across_the_wrap() -> None:
     hold, yaw, dt = HeadingHold(p=2.0, i=0.5), 3.0, 0.02
     for _ in range(500):

@@ -202,6 +202,33 @@ def test_a_command_that_waited_in_a_queue_takes_no_wheel_but_zero_always_does():
     assert at(7000, 3.0, 0, "c") and at(9000, 3.0, 0, "c")
 
 
+def test_as_many_writers_are_known_as_a_robot_may_have_and_no_more():
+    def judged(others: int, again: int = 0) -> bool:
+        """Tell whether a late command is refused after commands of others."""
+        one = Lease(0.2)
+        assert one.take("late", 3.0, 6.0, 50_000 * MS, 6000 * MS)  # its clock is elsewhere
+        for k in range(others):
+            one.take(f"writer {k}", 0.0, 6.1, 6100 * MS, 6100 * MS)
+        for _ in range(again):
+            one.take("late", 0.0, 6.2, 50_200 * MS, 6200 * MS)
+            one.take("one more", 0.0, 6.2, 6200 * MS, 6200 * MS)
+        return not one.take("late", 3.0, 6.8, 50_300 * MS, 6800 * MS)
+
+    assert judged(63) and not judged(64)
+    # Who was heard since is not the one that is forgotten.
+    assert judged(63, again=1)
+
+
+def test_refused_writers_are_counted_apart_up_to_as_many():
+    one = Lease(0.2)
+    one.take("owner", 3.0, 1.0)
+    for k in range(1000):
+        one.take(f"writer {k}", 3.0, 1.1)
+    one.take("writer 3", 3.0, 1.1)
+    assert one.refused["writer 3"] == 2 and one.refused["others"] == 1000 - 64
+    assert len(one.refused) == 65
+
+
 LIMITS = FaultLimits(current_limit=3.0, current_time=0.05)
 
 
