@@ -11,6 +11,7 @@ import time
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from functools import partial
+from typing import Any
 
 from rclpy.node import Node
 
@@ -21,6 +22,7 @@ from smp_motor_control.excitation import SIGNALS, Bounded, Excitation
 from smp_motor_control.fields import fixed
 from smp_motor_control.nodes import runtime
 from smp_motor_control.nodes.motor_writer import MotorWriter
+from smp_motor_control.nodes.publishers import PublisherWatch, two_publishers
 from smp_motor_control.nodes.settings import Parameters
 from smp_motor_control.wheel.protection import Bounds, Protection
 
@@ -93,12 +95,14 @@ class Excite(Node):
         self._outputs: list[tuple[MotorWriter, Excitation]] = []
         self._watched: dict[str, Protection] = {}
         self._unheard: dict[str, float] = {}
+        self._states: dict[str, PublisherWatch] = {}
         bounds = Bounds(speed=settings.max_speed, current=settings.max_current)
         for k, wheel in enumerate(settings.chosen()):
             signal = settings.signal_of(k)
             signal(0.0)  # Prepared now, not in the first period.
             self._outputs.append((MotorWriter(self, f"{wheel}/"), signal))
             self._watched[wheel] = Protection(bounds)
+            self._states[wheel] = PublisherWatch()
             topic, take = f"{wheel}/motor_state", partial(self._watch, wheel)
             self.create_subscription(MotorState, topic, take, runtime.STREAM_SUBSCRIBER)
         self._begin: float | None = None
@@ -137,8 +141,11 @@ class Excite(Node):
                     f"{wheel}: no motor_state for {_SILENCE:g} s; does its driver run?"
                 )
 
-    def _watch(self, wheel: str, message: MotorState) -> None:
+    def _watch(self, wheel: str, message: MotorState, info: Mapping[str, Any]) -> None:
         self._unheard[wheel] = 0.0
+        self._states[wheel].hear(info)
+        if self._states[wheel].doubled:
+            raise LimitError(two_publishers(self, f"{wheel}/motor_state"))
         stamp = runtime.seconds(message.header.stamp)
         why = self._watched[wheel].add(stamp, message.current, message.velocity)
         if why and self._begin is not None:

@@ -28,6 +28,7 @@ from smp_motor_control import controller_of
 from smp_motor_control.errors import SmpError
 from smp_motor_control.nodes.executor import LeanExecutor
 from smp_motor_control.nodes.guard import Guard
+from smp_motor_control.nodes.publishers import UNKNOWN, PublisherWatch, are_known, two_publishers
 from smp_motor_control.nodes.runtime import LATCHED, STREAM_SUBSCRIBER, seconds, steady_timer
 
 PATIENCE = 10.0
@@ -38,10 +39,8 @@ AGAIN = 0.25
 not yet discovered this client, so no request may do harm twice."""
 
 LOOK = 0.02  # interval at which a condition is looked at [s]
+ENOUGH = 30  # states of a wheel that tell whether one node publishes them
 DISCOVERY = 1.0  # time in which a free machine discovers what is there [s]
-UNKNOWN = "_NODE_NAME_UNKNOWN_"
-"""What the middleware calls the node of an endpoint that it discovered before the node."""
-
 GET, SET = "get_parameters", "set_parameters_atomically"
 
 _AFTER = {"configure": "inactive", "activate": "active", "deactivate": "inactive"}
@@ -126,10 +125,13 @@ class RobotClient:
         kind: Any,
         topic: str,
         wheels: Iterable[str],
-        take: Callable[[str, Any], object],
+        take: Callable[..., object],
         quality: QoSProfile = STREAM_SUBSCRIBER,
     ) -> Any:
-        """Hand messages of a topic of every wheel to a callable, behind the wheel's name."""
+        """Hand messages of a topic of every wheel to a callable, behind the wheel's name.
+
+        A callable of three arguments gets what the middleware knows of the message, too.
+        """
         topics = {f"{wheel}/{topic}": partial(take, wheel) for wheel in wheels}
         return self.listen(kind, topics, quality)
 
@@ -141,16 +143,28 @@ class RobotClient:
         return [found[1] for name in sorted(topics) if (found := pattern.fullmatch(name))]
 
     def wait_for_wheels(self, wheels: Sequence[str], timeout: float) -> dict[str, float]:
-        """Wait until every wheel has reported for half a second; return their rates [Hz]."""
-        stamps: dict[str, list[float]] = {wheel: [] for wheel in wheels}
+        """Wait until every wheel has reported for half a second; return their rates [Hz].
 
-        def take(wheel: str, message: MotorState) -> None:
-            stamps[wheel].append(seconds(message.header.stamp))
+        Wheels that two publishers report, and reports without a stamp, are errors.
+        """
+        stamps: dict[str, list[float]] = {wheel: [] for wheel in wheels}
+        watches = {wheel: PublisherWatch() for wheel in wheels}
+
+        def take(wheel: str, message: MotorState, info: Mapping[str, Any]) -> None:
+            watches[wheel].hear(info)
+            stamp = seconds(message.header.stamp)
+            if not stamp:
+                raise RobotError(
+                    f"{self._full(wheel)}/motor_state has no stamp; its driver must fill in the "
+                    "instant of sampling"
+                )
+            stamps[wheel].append(stamp)
 
         with self.listen_to_wheels(MotorState, "motor_state", wheels, take):
             heard = self.until(
                 lambda: all(seen and seen[-1] - seen[0] > 0.5 for seen in stamps.values()), timeout
             )
+        self._refuse_doubled(watches)
         if not heard:
             silent = [wheel for wheel, seen in stamps.items() if not seen or seen[-1] == seen[0]]
             topic = ", ".join(self._full(f"{wheel}/motor_state") for wheel in silent or wheels)
@@ -160,22 +174,27 @@ class RobotClient:
         return {w: (len(s) - 1) / (s[-1] - s[0]) for w, s in stamps.items()}
 
     def refuse_second_reporters(self, wheels: Iterable[str]) -> None:
-        """Raise where two nodes publish one wheel's ``motor_state``, and name both.
+        """Raise where two nodes publish the state of one wheel, and name both."""
+        watches = {wheel: PublisherWatch() for wheel in wheels}
+        heard = dict.fromkeys(watches, 0)
 
-        A node that was killed stays in the graph for a while: it is waited for.
-        """
-        topics = [self._full(f"{wheel}/motor_state") for wheel in wheels]
+        def take(wheel: str, message: MotorState, info: Mapping[str, Any]) -> None:
+            watches[wheel].hear(info)
+            heard[wheel] += 1
 
-        def mixed() -> dict[str, list[str]]:
-            found = {topic: sorted(self._publishers(topic)) for topic in topics}
-            return {topic: names for topic, names in found.items() if len(names) > 1}
+        def decided() -> bool:
+            seen = min(heard.values(), default=ENOUGH) >= ENOUGH
+            return seen or any(one.doubled for one in watches.values())
 
-        self.until(lambda: not mixed(), PATIENCE)
-        for topic, names in mixed().items():
-            raise RobotError(
-                f"{topic} has {len(names)} publishers, {' and '.join(names)}: their samples mix. "
-                "End all but one, or give each robot its namespace or ROS domain"
-            )
+        with self.listen_to_wheels(MotorState, "motor_state", watches, take):
+            self.until(decided, DISCOVERY)
+        self._refuse_doubled(watches)
+
+    def _refuse_doubled(self, watches: Mapping[str, PublisherWatch]) -> None:
+        topics = [f"{wheel}/motor_state" for wheel, one in watches.items() if one.doubled]
+        if topics:
+            self.until(lambda: all(are_known(self.node, one) for one in topics), DISCOVERY)
+            raise RobotError("; ".join(two_publishers(self.node, topic) for topic in topics))
 
     def runs_controller(self, wheel: str) -> bool:
         """Tell whether a wheel's ``wheel_pid`` has been discovered."""
@@ -316,15 +335,6 @@ class RobotClient:
     def _commanders(self, wheel: str) -> list[str]:
         topic = self._full(f"{wheel}/motor_command")
         return [info.node_name for info in self.node.get_publishers_info_by_topic(topic)]
-
-    def _publishers(self, topic: str) -> list[str]:
-        """Return the full names of the nodes that publish a topic, UNKNOWN where not known yet."""
-        found = self.node.get_publishers_info_by_topic(topic)
-        return [
-            UNKNOWN if UNKNOWN in (one.node_name, one.node_namespace)
-            else f"{one.node_namespace.rstrip('/')}/{one.node_name}"
-            for one in found
-        ]  # fmt: skip
 
     @contextlib.contextmanager
     def paused(self, wheels: Sequence[str]) -> Any:

@@ -2,7 +2,9 @@
 
 import math
 import time
+from collections.abc import Mapping
 from functools import partial
+from typing import Any
 
 from geometry_msgs.msg import Twist, TwistStamped
 from rclpy.node import Node
@@ -15,6 +17,7 @@ from smp_motor_control.body.odometry import LEAST_STEP, Odometry
 from smp_motor_control.body.wheel_travel import WheelFeedback, WheelSample
 from smp_motor_control.nodes import runtime
 from smp_motor_control.nodes.odometry_output import OdometryOutput
+from smp_motor_control.nodes.publishers import PublisherWatch, two_publishers, watched
 from smp_motor_control.nodes.settings import Parameters
 from smp_motor_control.nodes.skid_steer_settings import Settings
 from smp_motor_control.wheel.stop import StopRule
@@ -41,6 +44,7 @@ class SkidSteerNode(Node):
         self._command = BodyCommand()
         self._stop = StopRule()
         self._left, self._right = settings.left_wheel_names, settings.right_wheel_names
+        self._unstamped: dict[str, bool] = {}
         size = settings.velocity_rolling_window_size
         window = size / settings.publish_rate
         self._feedback = WheelFeedback(self._left, self._right, window=window)
@@ -67,6 +71,7 @@ class SkidSteerNode(Node):
         self._unheard = ""
         self._listen_to(self._preferred)
         self._look = runtime.steady_timer(self, LOOK, self._follow_type)
+        self._states = {wheel: PublisherWatch() for wheel in wheels}
         for wheel in wheels:
             self.create_subscription(
                 MotorState, f"{wheel}/motor_state", partial(self._on_state, wheel), best_effort
@@ -78,7 +83,10 @@ class SkidSteerNode(Node):
     def _listen_to(self, kind: type) -> None:
         take = self._on_stamped if kind is TwistStamped else self._on_twist
         self._kind = kind
-        self._cmd_vel = self.create_subscription(kind, "cmd_vel", take, runtime.STREAM_SUBSCRIBER)
+        self._commands = PublisherWatch()
+        self._cmd_vel = self.create_subscription(
+            kind, "cmd_vel", watched(self._commands, take), runtime.STREAM_SUBSCRIBER
+        )
 
     def _follow_type(self) -> None:
         """Listen to the type of command that is published: a process can have one by topic."""
@@ -125,11 +133,15 @@ class SkidSteerNode(Node):
             old = f" ({age:.3f} s)" if verdict is Verdict.STALE else ""
             self.get_logger().warning(f"cmd_vel {verdict.value}{old}", throttle_duration_sec=1.0)
 
-    def _on_state(self, wheel: str, message: MotorState) -> None:
-        sample = WheelSample(
-            runtime.seconds(message.header.stamp), message.position, message.velocity
-        )
-        self._feedback.receive(wheel, sample, time.monotonic())
+    def _on_state(self, wheel: str, message: MotorState, info: Mapping[str, Any]) -> None:
+        watch = self._states[wheel]
+        restarted = watch.hear(info)
+        if watch.doubled:
+            return  # nobody knows which of them is the wheel
+        stamp = runtime.seconds(message.header.stamp)
+        self._unstamped[wheel] = not stamp
+        sample = WheelSample(stamp or self._now(), message.position, message.velocity)
+        self._feedback.receive(wheel, sample, time.monotonic(), restarted)
 
     def _on_imu(self, message: Imu) -> None:
         """Take the yaw from the orientation, or integrate the yaw rate where there is none."""
@@ -234,9 +246,17 @@ class SkidSteerNode(Node):
                 for wheel, age in silent.items()
             )
             problems.append((runtime.ERROR, f"no feedback from {wheels}"))
-        told = "; ".join(f"{wheel}: {what}" for wheel, what in self._feedback.problems.items())
+        for wheel, watch in self._states.items():
+            if watch.doubled:
+                problems.append((runtime.ERROR, two_publishers(self, f"{wheel}/motor_state")))
+        if self._commands.doubled:
+            problems.append((runtime.WARN, two_publishers(self, "cmd_vel")))
+        told = [f"{wheel}: {what}" for wheel, what in self._feedback.problems.items()]
+        told += [
+            f"{wheel}: motor_state has no stamp" for wheel, no in self._unstamped.items() if no
+        ]
         if told and not settings.open_loop:
-            problems.append((runtime.WARN, told))
+            problems.append((runtime.WARN, "; ".join(told)))
         if now - self._refused_at < REPORTED:
             problems.append((runtime.WARN, f"cmd_vel {self._refused}"))
         if self._unheard:

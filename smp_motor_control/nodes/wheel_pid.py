@@ -9,7 +9,7 @@ import contextlib
 import gc
 import os
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -27,6 +27,7 @@ from smp_motor_control.fields import fixed, nested
 from smp_motor_control.motor.parameters import Gearbox
 from smp_motor_control.nodes import runtime
 from smp_motor_control.nodes.motor_writer import MotorWriter
+from smp_motor_control.nodes.publishers import PublisherWatch, watched
 from smp_motor_control.nodes.settings import Parameters
 from smp_motor_control.nodes.wheel_report import WheelReport, pid_state
 from smp_motor_control.wheel.controller import WheelController, WheelSettings
@@ -73,18 +74,21 @@ class WheelPid(LifecycleNode):
         self._writer = MotorWriter(self)
         self._shown = self.create_publisher(PidState, "pid_state", runtime.STREAM_PUBLISHER)
         listen = self.create_subscription
+        self._states, self._setpoints = PublisherWatch(), PublisherWatch()
+        asked = watched(self._setpoints, self._ask)
         self._entities = [
             (MotorWriter.destroy, self._writer),
             (self.destroy_publisher, self._shown),
             (self.destroy_subscription, listen(MotorState, "motor_state", self._hear, heard)),
             (self.destroy_subscription,
-             listen(JointState, f"{self._robot}/wheel_setpoints", self._ask, heard)),
+             listen(JointState, f"{self._robot}/wheel_setpoints", asked, heard)),
             (self.destroy_subscription,
              listen(MotorDescription, "motor_description", self._describe, runtime.LATCHED)),
             (self.destroy_service, self.create_service(Trigger, "~/reset", self._reset)),
             (self.destroy_timer, runtime.steady_timer(self, _WATCH_PERIOD, self._watch)),
         ]  # fmt: skip
-        self._report = WheelReport(self, self._wheel, self._joint)
+        watches = {"motor_state": self._states, f"{self._robot}/wheel_setpoints": self._setpoints}
+        self._report = WheelReport(self, self._wheel, self._joint, watches)
         return _DONE
 
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
@@ -151,7 +155,8 @@ class WheelPid(LifecycleNode):
         age = self._now() * 1e-9 - stamp.sec - stamp.nanosec * 1e-9 if given else 0.0
         self._wheel.take_setpoint(message.velocity[index], time.monotonic(), age)
 
-    def _hear(self, message: MotorState) -> None:
+    def _hear(self, message: MotorState, info: Mapping[str, Any]) -> None:
+        self._states.hear(info)
         wheel, stamp = self._wheel, message.header.stamp
         nanoseconds = runtime.nanoseconds(stamp)
         voltage = wheel.take_feedback(message, nanoseconds, self._now(), time.monotonic())
@@ -169,6 +174,7 @@ class WheelPid(LifecycleNode):
             self._watched = self._shown.get_subscription_count() > 0
             simulated = self.get_clock().ros_time_is_active
             self._now = self._ros_now if simulated else time.time_ns
+            self._wheel.doubled = self._states.doubled
         self._wheel.owner = self._writer.owner
         voltage = self._wheel.tick(time.monotonic())
         if voltage is not None:

@@ -8,6 +8,7 @@ from rclpy.node import Node
 
 from smp_interfaces.msg import PidState
 from smp_motor_control.nodes import runtime
+from smp_motor_control.nodes.publishers import PublisherWatch, two_publishers
 from smp_motor_control.pid import PidGains
 from smp_motor_control.wheel.controller import State, WheelController
 from smp_motor_control.wheel.freshness import Verdict
@@ -27,6 +28,12 @@ UNTUNED = (
 )
 
 
+UNSTAMPED = (
+    "motor_state has no stamp: its arrival counts, and its delay is not seen; the driver must fill "
+    "in the instant of sampling"
+)
+
+
 def untuned(gains: PidGains) -> bool:
     """Return whether nobody has given gains."""
     return (gains.p, gains.i, gains.d) == (PidGains().p, PidGains().i, PidGains().d)
@@ -35,9 +42,15 @@ def untuned(gains: PidGains) -> bool:
 class WheelReport:
     """Assesses one wheel for ``/diagnostics``, every second and on every change of its state."""
 
-    def __init__(self, node: Node, wheel: WheelController, joint: str) -> None:
+    def __init__(
+        self,
+        node: Node,
+        wheel: WheelController,
+        joint: str,
+        watches: Mapping[str, PublisherWatch] | None = None,
+    ) -> None:
         self.timekeeping: list[str] = []
-        self._wheel = wheel
+        self._wheel, self._node, self._watches = wheel, node, watches or {}
         self._reported: dict[str, int] = {}
         self.shown: State | None = None
         self._log = node.get_logger()
@@ -99,6 +112,9 @@ class WheelReport:
             message = f"{message}; in the last second: {listed}"
             level = max(level, runtime.WARN)
         advice = [text for text in (self._wheel.advice, self._swing()) if text]
+        advice += [two_publishers(self._node, t) for t, one in self._watches.items() if one.doubled]
+        if self._wheel.clock.unstamped:
+            advice.append(UNSTAMPED)
         if advice:
             level = max(level, runtime.WARN)
         if untuned(self._wheel.settings.loop.gains):

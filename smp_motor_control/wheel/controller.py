@@ -41,6 +41,7 @@ class State(Enum):
     NO_FEEDBACK = "no feedback: 0 V"
     LATE_FEEDBACK = "feedback is late: 0 V"
     BAD_FEEDBACK = "feedback is not a number or implausible: left out"
+    DOUBLED = "two publishers of motor_state: 0 V"
     NOT_OURS = "not yours: another node drives this wheel: 0 V"
     ROLLING = "rolls at 0 V: a wheel that was at fault is not braked until it is asked to turn"
     FAULT = "fault: 0 V"
@@ -91,6 +92,7 @@ class WheelController:
         self.active = False  # whether it answers feedback
         self.answer: PidOutput | None = None  # the last one's parts, where it was the loop's
         self.owner = ""  # another node that owns the wheel by its lease
+        self.doubled = False  # whether two publishers say what the wheel does
         self.steps = 0
         self._wheel = Circumstances()
         self._intervals: list[float] = []
@@ -271,9 +273,10 @@ class WheelController:
             turns = abs(measurement) > self.settings.faults.stall_velocity
             if not recovery.may_release(setpoint or 0.0, now, turns):
                 return self._zero(State.FAULT)
-        if setpoint is None or self.owner or (recovery.cautious and setpoint == 0.0):
+        kept = bool(self.owner) or self.doubled
+        if setpoint is None or kept or (recovery.cautious and setpoint == 0.0):
             self._resume = True
-            if setpoint == 0.0 and not self.owner:  # obeyed, without the loop
+            if setpoint == 0.0 and not kept:  # obeyed, without the loop
                 self.loop.reference = self.loop.reference._replace(velocity=0.0)
                 self.answer, self.target, self.measurement = _STANDS, 0.0, measurement
             return self._zero(self._idle(setpoint, measurement))
@@ -329,6 +332,8 @@ class WheelController:
         """Return why a wheel without a fault is left at zero."""
         if setpoint is None:
             return State.WAITING if self._setpoint_at == -math.inf else State.TIMED_OUT
+        if self.doubled:
+            return State.DOUBLED
         if self.owner:
             return State.NOT_OURS
         return State.ROLLING if abs(measurement) > AT_REST else State.DRIVING

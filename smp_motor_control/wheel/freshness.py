@@ -37,6 +37,7 @@ class FeedbackClock:
         self.max_gap = max_gap
         self.counts = dict.fromkeys(Verdict, 0)
         self.jumps = 0  # of the stamps' clock
+        self.unstamped = False  # whether the last sample had no stamp
         self.offset = 0.0  # learnt difference of the clocks [s]
         self.dt = 0.0  # interval that ends with the last fresh sample [s]
         self.gap = 0.0  # interval that was too long, where the last sample came after one [s]
@@ -53,6 +54,7 @@ class FeedbackClock:
 
         ``steady`` is the arrival on a clock that nobody sets [s].
         """
+        self.unstamped = not stamp
         verdict = self._judge(stamp or now, now, now * 1e-9 if steady is None else steady)
         self.counts[verdict] += 1
         return verdict

@@ -30,6 +30,7 @@ from smp_motor_control.encoder import wrap
 from smp_motor_control.errors import ParameterError, SmpError
 from smp_motor_control.fields import described, fixed, nested
 from smp_motor_control.nodes import executor, runtime
+from smp_motor_control.nodes.publishers import PublisherWatch, two_publishers
 from smp_motor_control.nodes.settings import Parameters
 from smp_motor_ident.bag import read
 from smp_motor_ident.bag.window import Window
@@ -78,12 +79,14 @@ class Wheel:
 
     def __init__(self, node: Node, name: str, length: float, monitor: Monitor | None) -> None:
         self.window = Window(name, length)
+        self.watch = PublisherWatch()
         self.monitor = monitor
         self._count: int | None = None
         self._position = math.nan
         self.joint_name = joint_of(name)
         self.stamp = Time()
         self.status = "collecting: no motor_state yet"
+        self.unstamped = False
         self.running: Future[tuple[Estimate | Exception, float]] | None = None
         # Stamp of the last sample when last looked at, and of the last estimate's [ns]
         self.seen = self.estimated = 0
@@ -107,6 +110,10 @@ class Wheel:
     def _on_state(self, message: MotorState, info: Mapping[str, Any]) -> None:
         self.stamp = stamp = message.header.stamp
         nanoseconds = runtime.nanoseconds(stamp)
+        self.unstamped = not nanoseconds
+        self.watch.hear(info)
+        if self.watch.doubled or self.unstamped:
+            return  # of two wheels, or of no instant
         if self.monitor is not None:
             turned = self._turned(message.encoder_count, message.position)
             self.monitor.add(1e-9 * nanoseconds, message.voltage, message.current, turned)
@@ -183,6 +190,7 @@ class Identifier(Node):
             if wheel.running or (wheel.seen and wheel.seen == wheel.estimated):
                 continue
             try:
+                self._check_source(wheel)
                 record = wheel.window.record()
                 lacks = missing(record, settings.demands)
             except (SmpError, ArithmeticError, ValueError) as error:
@@ -192,6 +200,14 @@ class Identifier(Node):
             elif ceased or now >= self._not_before:
                 wheel.estimated = wheel.seen
                 wheel.running = self._worker.submit(partial(_identify, record, settings.model))
+
+    def _check_source(self, wheel: Wheel) -> None:
+        """Refuse samples of two publishers, and such without a stamp."""
+        topic = f"{wheel.window.wheel}/motor_state"
+        if wheel.watch.doubled:
+            raise SmpError(two_publishers(self, topic))
+        if wheel.unstamped:
+            raise SmpError(f"{topic} has no stamp; its driver must fill in the instant of sampling")
 
     def _publish_finished(self) -> None:
         for wheel in self._wheels.values():
@@ -216,6 +232,9 @@ class Identifier(Node):
         valid = sum(wheel.status.startswith("valid") for wheel in self._wheels.values())
         level = runtime.OK if valid == len(states) else runtime.WARN
         message = f"{valid} of {len(states)} wheels identified"
+        doubled = [f"{n}/motor_state" for n, w in self._wheels.items() if w.watch.doubled]
+        if doubled:
+            return runtime.ERROR, "; ".join(two_publishers(self, one) for one in doubled), states
         watched = {n: w.monitor for n, w in self._wheels.items() if w.monitor is not None}
         if watched:  # then a wheel that has nothing to say of itself is no warning
             level, message = runtime.OK, f"{len(watched)} wheels watched; {message}"

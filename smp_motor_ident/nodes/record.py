@@ -8,7 +8,7 @@ third of the time, and the queue's reception stamps stay exact.
 import argparse
 import shutil
 import sys
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from datetime import datetime
 from pathlib import Path
 from typing import Any
@@ -21,6 +21,7 @@ from rclpy.topic_endpoint_info import TopicEndpointInfo
 
 from smp_motor_control.errors import SmpError
 from smp_motor_control.nodes import executor, runtime
+from smp_motor_control.nodes.publishers import PublisherWatch, are_known, two_publishers
 from smp_motor_control.ros_arguments import split_arguments
 from smp_motor_ident.bag import BagWriter
 from smp_motor_ident.bag.writer import DEFAULT_QOS
@@ -32,6 +33,10 @@ DEPTH = 2000
 """Messages that DDS keeps for us per topic: two seconds of 1 kHz while the disk is busy."""
 
 
+ONE_PUBLISHER = ("smp_interfaces/msg/MotorState", "smp_interfaces/msg/PidState")
+"""What only one node can know; of other types several publishers may be meant."""
+
+
 @dataclass
 class Topic:
     type: str
@@ -39,6 +44,8 @@ class Topic:
     publishers: int
     last_number: int = 0
     lost: int = 0
+    watch: PublisherWatch = field(default_factory=PublisherWatch)
+    doubled: bool = False  # whether that was said
 
 
 def subscription_qos(offered: list[QoSProfile]) -> QoSProfile:
@@ -133,6 +140,10 @@ class Recorder(Node):
     def _take_all(self) -> None:
         for name, topic in self._topics.items():
             self._take(name, topic)
+            doubled = topic.type in ONE_PUBLISHER and topic.watch.doubled
+            if doubled and not topic.doubled and are_known(self, name):
+                topic.doubled = True
+                self.get_logger().warning(two_publishers(self, name))
         self._writer.flush()
 
     def _take(self, name: str, topic: Topic) -> None:
@@ -143,6 +154,7 @@ class Recorder(Node):
                 data, info = taken
                 # Publishers number their messages, each for itself: a gap is a loss.
                 number = info["publication_sequence_number"] or 0
+                topic.watch.hear(info)
                 if topic.publishers != 1:
                     number = 0
                 elif 0 < topic.last_number < number - 1:
@@ -160,8 +172,10 @@ class Recorder(Node):
             print(f"record: {error}", file=sys.stderr, flush=True)
         counts = self._writer.counts
         for name, count in sorted(counts.items()):
-            lost = self._topics[name].lost
-            print(f"{count:9d}  {name}" + (f"  ({lost} lost)" if lost else ""), flush=True)
+            topic = self._topics[name]
+            notes = f"  ({topic.lost} lost)" if topic.lost else ""
+            notes += "  (of two publishers)" if topic.doubled else ""
+            print(f"{count:9d}  {name}{notes}", flush=True)
         print(f"{sum(counts.values()):9d}  messages in {self._writer.path}", flush=True)
 
 

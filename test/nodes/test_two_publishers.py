@@ -1,0 +1,182 @@
+"""Two publishers of one wheel, as of a forgotten node, are named by everybody who reads it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+
+import pytest
+from diagnostic_msgs.msg import DiagnosticArray
+from domain_node import DomainNode
+from sensor_msgs.msg import JointState
+
+from smp_interfaces.msg import MotorCommand, MotorState
+from smp_motor_control.nodes.publishers import FALLS, PublisherWatch
+from smp_motor_control.nodes.robot_client import RobotClient, RobotError
+
+WHEELS = ("left", "right")
+STUCK = ["--ros-args", "-r", "__ns:=/left", "-p", "p:=2.0", "-p", "stall_time:=0.0",
+         "-p", "tracking_time:=0.0"]  # fmt: skip
+"""Arguments of a wheel_pid that takes no offence at a wheel that never turns."""
+BOTH = "/left/motor_state comes from /driver and /forgotten at once: end one of them"
+
+
+class Driver(DomainNode):
+    """Publishes the states of two wheels, each standing somewhere else."""
+
+    def __init__(self, domain: int, name: str, position: float) -> None:
+        super().__init__(domain, name)
+        make = self.node.create_publisher
+        self.states = [make(MotorState, f"{wheel}/motor_state", 10) for wheel in WHEELS]
+        self.setpoints = make(JointState, "wheel_setpoints", 10)
+        self.position, self.stamped, self.speed = position, True, 0.0
+
+    def publish(self) -> None:
+        message = MotorState(position=self.position, velocity=self.speed, current=math.nan)
+        if self.stamped:
+            message.header.stamp = self.node.get_clock().now().to_msg()
+        for publisher in self.states:
+            publisher.publish(message)
+
+    def ask(self, speed: float) -> None:
+        self.setpoints.publish(JointState(name=["left_wheel_joint"], velocity=[speed]))
+
+
+class Robot:
+    """A driver, perhaps a forgotten one, and what the nodes say."""
+
+    def __init__(self, domain: int) -> None:
+        self.driver = Driver(domain, "driver", 1.0)
+        self.forgotten: Driver | None = None
+        self.domain = domain
+        self.said: dict[str, str] = {}
+        self.voltages: list[float] = []
+        node = self.driver.node
+        node.create_subscription(DiagnosticArray, "/diagnostics", self.take, 100)
+        heard = lambda message: self.voltages.append(message.voltage)  # noqa: E731
+        node.create_subscription(MotorCommand, "left/motor_command", heard, 100)
+
+    def take(self, message: DiagnosticArray) -> None:
+        self.said.update({one.name: one.message for one in message.status})
+
+    def run(self) -> None:
+        self.driver.publish()
+        self.driver.ask(1.0)
+        if self.forgotten is not None:
+            self.forgotten.publish()
+        self.driver.spin()
+
+    def forget(self) -> None:
+        self.forgotten = Driver(self.domain, "forgotten", 9.0)
+
+    def end_the_forgotten(self) -> None:
+        assert self.forgotten is not None
+        self.forgotten.close()
+        self.forgotten = None
+
+
+@pytest.fixture
+def robot(ros_domain: int) -> Iterator[Robot]:
+    robot = Robot(ros_domain)
+    yield robot
+    robot.driver.close()
+    if robot.forgotten is not None:
+        robot.forgotten.close()
+
+
+def names(*parameters: str) -> list[str]:
+    return ["--ros-args", *(part for one in parameters for part in ("-p", one))]
+
+
+def test_every_reader_names_both_and_the_wheel_stands(
+    process: Callable, robot: Robot, eventually: Callable
+) -> None:
+    process("wheel_pid", *STUCK)
+    process("skid_steer", *names("left_wheel_names:=[left]", "right_wheel_names:=[right]"))
+    process("identifier", *names("wheels:=[left]", "period:=0.5"))
+    recorder = process("record", "--output", "bag")
+    nodes = ("left/wheel_pid", "skid_steer", "identifier")
+    eventually(lambda: set(nodes) <= set(robot.said), 20.0, robot.run)
+    eventually(lambda: robot.voltages and robot.voltages[-1] > 0.0, 20.0, robot.run)
+    assert not any("at once" in message for message in robot.said.values())
+
+    robot.forget()
+    for name in nodes:
+        eventually(lambda name=name: BOTH in robot.said[name], 20.0, robot.run, robot.said[name])
+    eventually(lambda: BOTH in recorder.output, 20.0, robot.run, recorder.output)
+    assert robot.said["left/wheel_pid"].startswith("two publishers of motor_state: 0 V")
+    robot.voltages.clear()
+    eventually(lambda: len(robot.voltages) > 20, 5.0, robot.run)
+    assert set(robot.voltages) == {0.0}
+
+    robot.end_the_forgotten()
+    for name in nodes:
+        eventually(lambda name=name: "at once" not in robot.said[name], 20.0, robot.run)
+    eventually(lambda: robot.voltages[-1] > 0.0, 20.0, robot.run)
+
+
+def test_two_that_command_the_wheels_at_once_are_named(
+    process: Callable, robot: Robot, eventually: Callable
+) -> None:
+    process("wheel_pid", "--ros-args", "-r", "__ns:=/left", "-p", "p:=2.0")
+    eventually(lambda: "left/wheel_pid" in robot.said, 20.0, robot.run)
+    robot.forget()
+    assert robot.forgotten is not None
+    robot.forgotten.publish = lambda: robot.forgotten.ask(-1.0)  # type: ignore[method-assign]
+    both = "/wheel_setpoints comes from /driver and /forgotten at once"
+    eventually(lambda: both in robot.said["left/wheel_pid"], 20.0, robot.run, str(robot.said))
+
+
+@pytest.mark.parametrize("wait", [True, False])
+def test_a_client_refuses_a_wheel_of_two_publishers(
+    robot: Robot, eventually: Callable, wait: bool
+) -> None:
+    with RobotClient(name="tool") as client:
+        client.node.create_timer(0.01, robot.run)
+        assert client.wait_for_wheels(WHEELS, 20.0)["left"] > 5.0
+        client.refuse_second_reporters(WHEELS)
+        robot.forget()
+        with pytest.raises(RobotError, match="comes from /driver and /forgotten at once"):  # noqa: PT012
+            for _ in range(20):
+                if wait:
+                    client.wait_for_wheels(WHEELS, 20.0)
+                else:
+                    client.refuse_second_reporters(WHEELS)
+
+
+def test_states_without_a_stamp_are_named_and_refused_by_tools(
+    process: Callable, robot: Robot, eventually: Callable
+) -> None:
+    robot.driver.stamped = False
+    process("wheel_pid", *STUCK)
+    process("skid_steer", *names("left_wheel_names:=[left]", "right_wheel_names:=[right]"))
+    process("identifier", *names("wheels:=[left]", "period:=0.5"))
+    for name in ("left/wheel_pid", "skid_steer"):
+        eventually(lambda name=name: "no stamp" in robot.said.get(name, ""), 20.0, robot.run)
+    # Its arrival stands for it: the wheel is driven, and heard.
+    eventually(lambda: robot.voltages and robot.voltages[-1] > 0.0, 20.0, robot.run)
+    assert "no feedback" not in robot.said["skid_steer"]
+    with RobotClient(name="tool") as client:
+        client.node.create_timer(0.01, robot.run)
+        with pytest.raises(RobotError, match="/left/motor_state has no stamp"):
+            client.wait_for_wheels(["left"], 20.0)
+
+
+def test_numbers_that_fall_once_are_of_a_publisher_that_was_started_anew() -> None:
+    watch = PublisherWatch()
+    for start in range(FALLS - 1):
+        assert watch.hear({"publication_sequence_number": 1}) is bool(start)
+        for k in range(2, 50):
+            assert not watch.hear({"publication_sequence_number": k})
+    assert not watch.doubled
+    for k in range(50, 60):
+        watch.hear({"publication_sequence_number": k})
+        watch.hear({"publication_sequence_number": k})
+    assert watch.doubled
+
+
+def test_a_middleware_without_numbers_tells_nothing() -> None:
+    watch = PublisherWatch()
+    for _ in range(100):
+        assert not watch.hear({"publication_sequence_number": None})
+    assert not watch.doubled
