@@ -58,8 +58,9 @@ topics that their arguments name (`--help`).
 
 All nodes have `use_sim_time`: stamps, ages and the intervals of odometry and control are those of
 `/clock` then, and a `/clock` that is not heard is named on `/diagnostics`. Silence is measured in
-real time, so that a clock that stands still stops no watchdog, and the motors of `motor_plant` and
-the signals of `excite` pass in real time: simulated time is for a simulator of the motors.
+real time, so that a clock that stands still stops no watchdog: a clock so slow that feedback comes
+less often than `feedback_timeout` allows stops the wheels. The motors of `motor_plant` move in
+simulated time, too; the signals of `excite` pass in real time.
 """
 
 

@@ -6,7 +6,8 @@ Subscribes ``<wheel>/motor_command``, of one writer at a time, and ``<wheel>/loa
 ``<wheel>/motor_description``.  A motor of the file may have faults, such as swapped leads
 (``leads: -1``; see :class:`~smp_motor_control.motor.file.Wiring`).
 
-Physics runs on the steady clock over the real intervals; only the stamps are ROS time.
+Physics runs on the steady clock over the real intervals; only the stamps are ROS time.  With
+``use_sim_time`` it runs on that of ``/clock``: at whatever pace, and not at all while that stands.
 """
 
 import gc
@@ -77,6 +78,7 @@ class Wheel:
             resistance=entry.resistance if ohmmeter else math.nan,
         )
         timeout = motor.settings.command_timeout
+        self._instant = node.instant
         self._driver = motor_writer.MotorDriver(node, name, timeout, self._command, description)
         self.lease = self._driver.lease
         node.create_subscription(
@@ -84,22 +86,22 @@ class Wheel:
         )
 
     def _command(self, now: float, voltage: float) -> None:
-        if not self.motor.command(now, voltage):
+        if not self.motor.command(self._instant(), voltage):
             self.rejected += 1
 
     def _load(self, message: Float64) -> None:
-        if not self.motor.load(time.monotonic(), message.data):
+        if not self.motor.load(self._instant(), message.data):
             self.rejected += 1
 
     def publish(self, now: float, stamp: Any) -> None:
-        """Sample at an instant of the steady clock and publish it with its ROS time."""
+        """Sample at an instant of the physics' clock and publish it with its ROS time."""
         state = self._driver.state
         (
             state.voltage, state.current, state.velocity, state.position,
             state.encoder_count, state.duty_cycle,
         ) = self.motor.sample(now)  # fmt: skip
         self._driver.report(stamp)
-        self._driver.tell_owner(now)
+        self._driver.tell_owner(time.monotonic())
 
 
 class MotorPlant(Node):
@@ -113,7 +115,9 @@ class MotorPlant(Node):
         self._supply = Supply(0.0, settings.supply_resistance)
         self._nominal = max(entry.supply_voltage for entry in entries.values())
         self._supply.open_voltage = settings.battery_voltage or self._nominal
-        start, self._wheels = time.monotonic(), []
+        self._simulated = self.get_clock().ros_time_is_active
+        self._origin = self._shown = self.get_clock().now().nanoseconds
+        start, self._wheels = self.instant(), []
         for seed, (name, entry) in enumerate(entries.items(), 97 * settings.seed):
             motor = DrivenMotor(entry, settings.drive, self._supply, start, seed)
             self._wheels.append(Wheel(self, name, motor, settings.ohmmeter))
@@ -122,7 +126,8 @@ class MotorPlant(Node):
         self._last = start
         self._reading = math.inf
         self._diagnostics = runtime.Diagnostics(self, self._assess, "simulation")
-        self._timer = runtime.steady_timer(self, self._period, self._tick)
+        timer = self.create_timer if self._simulated else partial(runtime.steady_timer, self)
+        self._timer = timer(self._period, self._tick)
         names = ", ".join(entries)
         self.get_logger().info(f"simulating {names} at {settings.rate:g} Hz")
         gc.collect()
@@ -147,7 +152,7 @@ class MotorPlant(Node):
             wheel.lease.set_timeout(settings.drive.command_timeout)
 
     def _tick(self) -> None:
-        now, stamp = self._instant()
+        now, stamp = self._sampling_instant()
         if now - self._last < SHORTEST_INTERVAL * self._period:
             return
         self._late += now - self._last > 1.5 * self._period
@@ -156,8 +161,21 @@ class MotorPlant(Node):
         for wheel in self._wheels:
             wheel.publish(now, stamp)
 
-    def _instant(self) -> tuple[float, Any]:
+    def instant(self) -> float:
+        """Return the time of the physics, which never goes back [s]."""
+        if not self._simulated:
+            return time.monotonic()
+        now = self.get_clock().now().nanoseconds
+        if not self._shown:  # the first time that is heard
+            self._origin = now
+        self._origin += min(now - self._shown, 0)  # a clock that was set back stood still meanwhile
+        self._shown = now
+        return (now - self._origin) * 1e-9
+
+    def _sampling_instant(self) -> tuple[float, Any]:
         """Return one instant on both clocks: hardware stamps when it samples, however busy."""
+        if self._simulated:
+            return self.instant(), self.get_clock().now().to_msg()
         best, limit = math.inf, SAME_INSTANT * self._reading
         for _ in range(READINGS):
             before = time.monotonic()

@@ -3,14 +3,20 @@
 from __future__ import annotations
 
 import itertools
+import time
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
+import pytest
 from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.node import Node
 from rosgraph_msgs.msg import Clock
+from sensor_msgs.msg import JointState
 
 from smp_interfaces.msg import MotorCommand, MotorState
+
+GAINS = Path(__file__).resolve().parents[2] / "config" / "gains.yaml"
 
 NODES = {
     "motor_plant": (),
@@ -56,3 +62,64 @@ def test_a_missing_clock_is_named_by_every_node_and_a_present_one_followed(
     eventually(lambda: len(states) > 5 and len(commands) > 5, 10.0, tick)
     now = next(steps) // 200
     assert all(1000 <= m.header.stamp.sec <= now for m in (*states, *commands))
+
+
+class Pace:
+    """Publishes a clock of another pace, every 5 ms of its own time at most."""
+
+    def __init__(self, node: Node, factor: float) -> None:
+        self.node, self.factor, self.now = node, factor, 5000.0
+        self.sender = node.create_publisher(Clock, "/clock", 10)
+        self.setpoints = node.create_publisher(JointState, "wheel_setpoints", 10)
+        self.real = time.monotonic()
+
+    def step(self) -> None:
+        before, self.real = self.real, time.monotonic()
+        # What a busy machine leaves out is not made up for.
+        self.now += min(self.factor * (self.real - before), 0.005)
+        message = Clock()
+        message.clock.sec, message.clock.nanosec = int(self.now), int(self.now % 1 * 1e9)
+        self.sender.publish(message)
+        self.setpoints.publish(JointState(name=["front_left_wheel_joint"], velocity=[1.0]))
+        self.node.spin()
+
+
+def stamp(message: MotorState) -> float:
+    return message.header.stamp.sec + 1e-9 * message.header.stamp.nanosec
+
+
+@pytest.mark.parametrize("factor", [0.5, 2.0])
+def test_simulated_motors_move_in_simulated_time(
+    process: Callable[..., Any], node: Node, eventually: Callable[..., None], factor: float
+) -> None:
+    """At 1 rad/s of simulated time, whatever passes outside, and without a fault."""
+    states: list[MotorState] = []
+    said: dict[str, str] = {}
+    node.create_subscription(MotorState, "front_left/motor_state", states.append, 100)
+    take = lambda m: said.update({one.name: one.message for one in m.status})  # noqa: E731
+    node.create_subscription(DiagnosticArray, "/diagnostics", take, 50)
+    simulated = ("-p", "use_sim_time:=true")
+    process("motor_plant", "--ros-args", *simulated)
+    process(
+        "wheel_pid", "--ros-args", *simulated, "-r", "__ns:=/front_left", "--params-file", GAINS
+    )
+    pace = Pace(node, factor)
+    turning = lambda: bool(states) and abs(states[-1].velocity - 1.0) < 0.1  # noqa: E731
+    eventually(turning, 30.0, pace.step, str(said))
+    begun = states[-1]
+    eventually(lambda: stamp(states[-1]) - stamp(begun) > 3.0, 30.0, pace.step)
+    passed = stamp(states[-1]) - stamp(begun)
+    assert (states[-1].position - begun.position) / passed == pytest.approx(1.0, abs=0.02)
+    assert said["front_left/wheel_pid"].startswith("driving")
+
+    # A clock that is set back, as by a log that is played once more, is no jump of the motor.
+    before, pace.now = len(states), pace.now - 60.0
+    last = states[-1].position
+    eventually(lambda: len(states) > before + 5, 20.0, pace.step)
+    assert abs(states[-1].position - last) < 0.5
+    # And one that stands still stops the motors, and their feedback.
+    quiet = len(states)
+    end = time.monotonic() + 0.5
+    while time.monotonic() < end:
+        node.spin()
+    assert len(states) <= quiet + 3
