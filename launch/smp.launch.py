@@ -21,7 +21,7 @@ from launch_ros.parameter_descriptions import ParameterValue
 from launch_ros.substitutions import FindPackageShare
 
 from launch import LaunchDescription
-from smp_motor_control import LEFT, RIGHT
+from smp_motor_control import LEFT, RIGHT, check_wheel_names
 from smp_motor_control.body.description import robot_description
 from smp_motor_control.parameter_file import parameters_of, require_nodes
 
@@ -61,6 +61,7 @@ def start(context, *_) -> list:
     ]
     robot = "/" + given["namespace"].strip("/") if given["namespace"].strip("/") else ""
     wheels = [wheel for side in sides for wheel in side]
+    check_wheel_names(wheels)
     require_nodes(given["params_file"], [f"{robot}/{wheel}/wheel_pid" for wheel in wheels])
     common = {"use_sim_time": is_true(given, "use_sim_time")}
 

@@ -202,17 +202,16 @@ class MotorPlant(Node):
             values |= {f"{wheel.name} {key}": value for key, value in of_wheel.items()}
         rejected = [wheel.name for wheel in self._wheels if wheel.rejected]
         late = [wheel.name for wheel in self._wheels if wheel.lease.late > wheel.late]
-        rivals = {w.name: sorted(w.lease.refused) for w in self._wheels if w.lease.refused}
+        rivals = motor_writer.tell_refused({w.name: w.lease for w in self._wheels})
         for wheel in self._wheels:
-            wheel.late, wheel.lease.refused = wheel.lease.late, {}
+            wheel.late = wheel.lease.late
         message = "simulating"
         if rejected:
             message = f"refused messages that are no numbers: {rejected}"
         elif late:
             message = f"refused commands that come late by their stamps: {late}"
         elif rivals:
-            listed = "; ".join(f"{wheel}: {', '.join(names)}" for wheel, names in rivals.items())
-            message = f"not yours, refused on {listed}"
+            message = rivals
         return runtime.WARN if rejected or late or rivals else runtime.OK, message, values
 
 

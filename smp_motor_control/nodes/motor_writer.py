@@ -3,7 +3,7 @@
 import math
 import os
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 from rclpy.node import Node
@@ -55,6 +55,15 @@ class MotorWriter:
     def destroy(self) -> None:
         self._node.destroy_publisher(self.publisher)
         self._node.destroy_subscription(self._owners)
+
+
+def tell_refused(leases: Mapping[str, Lease]) -> str:
+    """Return the writers that were refused since last asked, by wheel; empty where none was."""
+    found = [f"{wheel}: {', '.join(sorted(one.refused))}" for wheel, one in leases.items()
+             if one.refused]  # fmt: skip
+    for one in leases.values():
+        one.refused = {}
+    return f"not yours, refused on {'; '.join(found)}" if found else ""
 
 
 class MotorDriver:

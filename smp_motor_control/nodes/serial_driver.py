@@ -28,7 +28,7 @@ from smp_motor_control.errors import ParameterError
 from smp_motor_control.fields import described, fixed
 from smp_motor_control.motor.parameters import SUPPLIES, Gearbox
 from smp_motor_control.nodes import runtime
-from smp_motor_control.nodes.motor_writer import MotorDriver
+from smp_motor_control.nodes.motor_writer import MotorDriver, tell_refused
 from smp_motor_control.nodes.settings import Parameters
 
 POLL = 0.002  # interval at which the line is read [s]
@@ -255,6 +255,8 @@ class SerialDriver(Node):
             "last problem": self._problem or "none",
             "late commands": sum(wheel.lease.late for wheel in self._wheels),
         }
+        leases = zip(self._settings.wheel_names, self._wheels)
+        rivals = tell_refused({name: wheel.lease for name, wheel in leases})
         if self._fd is None:
             return runtime.ERROR, f"{self._settings.device}: {self._problem}", values
         if now - self._heard > SILENCE:
@@ -264,6 +266,8 @@ class SerialDriver(Node):
             return runtime.WARN, found, values
         if self._supply != self._battery and not math.isnan(self._battery):
             return runtime.WARN, self._wrong_supply(), values
+        if rivals:
+            return runtime.WARN, rivals, values
         return runtime.OK, "driving", values
 
     def _wrong_supply(self) -> str:

@@ -14,6 +14,7 @@ from typing import Any
 from sensor_msgs.msg import BatteryState
 
 from smp_interfaces.msg import MotorDescription, MotorState
+from smp_motor_control.body.wheel_travel import WheelSample, WheelTravel
 from smp_motor_control.encoder import Unwrapper
 from smp_motor_control.errors import ParameterError
 from smp_motor_control.motor.parameters import check_supply
@@ -41,6 +42,20 @@ class Tape:
         if len(self.rows) <= since:
             return 0.0
         return abs(self.rows[-1][6] - self.rows[since][6])
+
+    def position_problem(self) -> str:
+        """Return what is wrong with the position, and what to do; empty where nothing is."""
+        samples = [WheelSample(row[0], row[5], row[4]) for row in self.rows]
+        if not samples:
+            return ""
+        travel = WheelTravel(samples[0])
+        # No wheel turns four times as fast as the fastest that its driver reports.
+        fastest = 4.0 * max(
+            (abs(s.velocity) for s in samples if math.isfinite(s.velocity)), default=0
+        )
+        for sample in samples[1:]:
+            travel.add(sample, fastest)
+        return travel.problem
 
 
 class WheelTest:

@@ -41,6 +41,9 @@ def test_launch_file_starts_plant_wheels_and_body_of_any_robot(tmp_path):
     assert "gains for the motors of the paper" in str(
         [part.text for one in started if isinstance(one, LogInfo) for part in one.msg]
     )
+    context.launch_configurations["left_wheels"] = "left, left"
+    with pytest.raises(ParameterError, match="named twice: left"):
+        module.start(context)
     context.launch_configurations["left_wheels"] = "unknown"
     with pytest.raises(ParameterError, match="says nothing to /unknown/wheel_pid"):
         module.start(context)

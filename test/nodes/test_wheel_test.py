@@ -1,0 +1,36 @@
+"""What a tape of a test of wheels tells of their driver."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+
+from smp_motor_control.nodes.wheel_test import Tape
+
+
+def tape(position) -> Tape:
+    """A wheel at 2 rad/s for 8 s, whose driver makes positions of its angle."""
+    rows = [(1e4 + t, 0.0, 3.0, 3.0, 2.0, position(2.0 * t), 0.0, 1.0)
+            for t in (0.01 * k for k in range(800))]  # fmt: skip
+    return Tape(rows)
+
+
+@pytest.mark.parametrize(
+    ("position", "words"),
+    [
+        (lambda angle: angle, ""),
+        (lambda angle: math.nan, ""),
+        (lambda angle: 0.0, "never changes"),
+        (lambda angle: angle % (2 * math.pi), "wraps"),
+        (lambda angle: math.remainder(angle, 2 * math.pi), "wraps"),
+        (lambda angle: angle if angle < 9.0 else angle - 9.0, "jumped"),
+    ],
+)
+def test_a_position_that_no_odometry_can_use_is_named(position, words: str) -> None:
+    said = tape(position).position_problem()
+    assert words in said and bool(words) is bool(said)
+
+
+def test_an_empty_tape_tells_nothing() -> None:
+    assert Tape().position_problem() == ""
