@@ -89,6 +89,43 @@ class Unwrapper:
         return self._total
 
 
+WIDTHS = (8, 16, 24, 32)
+"""Bits that hardware counters have."""
+
+
+class CounterWidth:
+    """Tells the width of a counter that wraps where nobody said so.
+
+    A step as large as a counter of some width has steps back is a wrap where the way that it leaves
+    is like that of the sample before.
+
+    Examples
+    --------
+    >>> width = CounterWidth()
+    >>> [width.step(count) for count in (32740, 32760, -32756, -32736)]
+    [0, 0, 16, 0]
+    """
+
+    def __init__(self) -> None:
+        self._count: int | None = None
+        self._moved: int | None = None
+
+    def step(self, count: int) -> int:
+        """Return the width of a counter that has just wrapped; 0 where it has not."""
+        before, self._count = self._count, count
+        moved = 0 if before is None else count - before
+        usual, self._moved = self._moved, moved
+        if usual is None or abs(moved) < 1 << (WIDTHS[0] - 1):
+            return 0
+        for bits in WIDTHS:
+            left = wrap(moved, bits)
+            alike = abs(left - usual) <= max(abs(usual), 8)
+            if alike and abs(moved) > 4 * abs(usual) and abs(moved - left) == 1 << bits:
+                self._moved = left
+                return bits
+        return 0
+
+
 class DifferencedSpeed:
     """Motor speed [rad/s] as counts moved over a window of samples; one is noisiest and fastest."""
 

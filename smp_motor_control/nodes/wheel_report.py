@@ -103,6 +103,17 @@ class WheelReport:
             f"halve p, i and d, or design them by tune --rate {rate:.0f}"
         )
 
+    def _strain(self) -> str:
+        """Return what is to be said of a wheel that turns too slowly for its voltage."""
+        strain = self._wheel.strain
+        if strain is None:
+            return ""
+        return (
+            f"it gets {strain[0]:.2g} V for {abs(self._wheel.measurement):.2g} rad/s, and "
+            f"{strain[1]:.2g} V would do: a heavy load, or an encoder that loses counts; look at "
+            "both before it overheats"
+        )
+
     def _assess(self) -> tuple[bytes, str, Mapping[str, object]]:
         level, message = self._state()
         totals = self._totals()
@@ -111,7 +122,12 @@ class WheelReport:
         if listed:
             message = f"{message}; in the last second: {listed}"
             level = max(level, runtime.WARN)
-        advice = [text for text in (self._wheel.advice, self._swing()) if text]
+        advice = [text for text in (self._wheel.advice, self._swing(), self._strain()) if text]
+        if self._wheel.loop.wraps_at:
+            advice.append(
+                f"encoder_count wraps at {self._wheel.loop.wraps_at} bits, and motor_description "
+                "says otherwise: set its encoder_bits to that"
+            )
         advice += [two_publishers(self._node, t) for t, one in self._watches.items() if one.doubled]
         if self._wheel.clock.unstamped:
             advice.append(UNSTAMPED)

@@ -242,6 +242,11 @@ class WheelController:
             except ParameterError as error:
                 self.advice = str(error)
 
+    @property
+    def strain(self) -> tuple[float, float] | None:
+        """Voltage of a wheel that turns too slowly for it, and what its speed takes [V]."""
+        return self._detector.strain if self.state is State.DRIVING else None
+
     def refuse(self, what: str) -> None:
         """Count something that was left out."""
         self.refused[what] += 1

@@ -35,6 +35,9 @@ _IMPROVING = 0.95
 _SATURATED = 0.7
 """Tolerated share of a set-point that the voltage may not suffice for, where that is unknown."""
 
+STRAIN, STRAIN_LASTS = 1.5, 1.5
+"""Times the voltage that its speed takes a wheel gets that is strained, and for how long [s]."""
+
 _GOOD = 0.1
 """Share of the speed within which a wheel follows well enough to learn its volts per speed."""
 
@@ -89,12 +92,15 @@ class FaultDetector:
         # Of the wheel [V s/rad], [V], where a model says; NaN and 0 where it is to be learnt.
         self.volts_per_speed, self.static_voltage = math.nan, 0.0
         self._learnt = math.nan
+        self._least = math.inf  # least volts per speed of a wheel that followed
         self.reset()
 
     def reset(self) -> None:
         """Forget what led here."""
         self._still = self._wrong = self._hot = 0.0
         self._wrong_speed = 0.0
+        self._strained = 0.0
+        self.strain: tuple[float, float] | None = None  # voltage in force, and that would do [V]
         self._begin_window(math.nan)
 
     def step(
@@ -169,6 +175,8 @@ class FaultDetector:
             asked = max(min(asked, reachable), -reachable)
         elif abs(asked - speed) < _GOOD * abs(speed) > _GOOD * _SLOWEST:
             self._learnt = abs(self._voltage / self._speed)
+            self._least = min(self._least, self._learnt)
+        self._judge_strain(abs(self._voltage) / elapsed, abs(speed), elapsed)
         error = abs(asked - speed)
         off = error > share * abs(asked) + _SLOWEST and self.limits.tracking_time > 0.0
         self._begin_window(speed if off else math.nan)
@@ -177,6 +185,14 @@ class FaultDetector:
         if stalled or not (off and error > _IMPROVING * way):
             return None
         return Fault.WRONG_WAY if asked * speed < 0.0 else Fault.NOT_FOLLOWING
+
+    def _judge_strain(self, voltage: float, speed: float, elapsed: float) -> None:
+        """Compare a window's voltage with what its speed takes, by a model or as it once did."""
+        per_speed = self.volts_per_speed if self.volts_per_speed > 0.0 else self._least
+        needed = per_speed * speed + self.static_voltage if per_speed < math.inf else math.inf
+        high = voltage > STRAIN * needed + 0.75 * self.limits.stall_voltage
+        self._strained = self._strained + elapsed if high else 0.0
+        self.strain = (voltage, needed) if self._strained >= STRAIN_LASTS else None
 
     def _reachable(self, voltage: float) -> float:
         """Return the speed for which a voltage suffices; infinite where that is not known."""

@@ -7,7 +7,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
-from smp_motor_control.encoder import DifferencedSpeed, Encoder
+from smp_motor_control.encoder import CounterWidth, DifferencedSpeed, Encoder
 from smp_motor_control.errors import ParameterError
 from smp_motor_control.fields import check_limits, described, nested, optional
 from smp_motor_control.motor.model import MotorModel
@@ -120,6 +120,7 @@ class WheelLoop:
     ) -> None:
         """Tell what is between motor and wheel."""
         self._gearbox, self._encoder, self._max_load = gearbox, encoder, max_load
+        self._width, self.wraps_at = CounterWidth(), 0  # bits at which it does, against its word
         self.renew_speed()
 
     def configure(self, settings: LoopSettings) -> None:
@@ -167,6 +168,11 @@ class WheelLoop:
 
     def speed(self, dt: float, velocity: float, count: int, voltage: float) -> float:
         """Return the wheel's speed after one more sample, NaN where it is not known or jumps."""
+        bits = self._width.step(count)
+        if bits and self._encoder is not None and self._encoder.bits != bits:
+            self.wraps_at = bits
+            self._encoder = replace(self._encoder, bits=bits)
+            self.renew_speed()
         speed = self._speed_of(dt, velocity, count, voltage)
         if speed != speed:
             return speed

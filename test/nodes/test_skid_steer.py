@@ -6,6 +6,7 @@ import json
 import math
 import sys
 import time
+from itertools import pairwise
 from pathlib import Path
 
 import pytest
@@ -100,6 +101,18 @@ def test_another_type_that_is_published_too_is_named(skid_steer, peer, process, 
     said = "also published as Twist, which is not heard"
     repeatedly(peer, lambda: peer.command(0.5), lambda: peer.diagnosis(said), eventually, 15.0)
     assert peer.drives(5.0, 5.0)
+
+
+def test_silence_brakes_within_the_limits(skid_steer, peer, eventually) -> None:
+    """ros-navigation/navigation2 issue 3481: a time-out that stops at once."""
+    skid_steer("-p", "linear.x.max_acceleration:=1.0")
+    repeatedly(peer, lambda: peer.command(0.5), lambda: peer.drives(5.0, 5.0), eventually)
+    peer.setpoints.clear()
+    eventually(lambda: peer.drives(0.0, 0.0), 5.0, peer.spin)
+    braking = [m.velocity[0] for m in peer.setpoints if 0.0 < m.velocity[0] < 5.0]
+    # 0.5 m/s at 1 m/s^2 in steps of 10 ms; a busy machine's are longer, up to 50 ms.
+    assert len(braking) >= 9
+    assert max(a - b for a, b in pairwise([5.0, *braking, 0.0])) < 0.51
 
 
 @pytest.mark.parametrize(

@@ -44,6 +44,44 @@ def test_odometry_follows_simulated_time_at_half_the_pace(skid_steer, peer, even
     assert peer.odometry[-1].pose.pose.position.x < 0.1 * 0.5 * (time.monotonic() - begun) + 0.01
 
 
+def test_odometry_goes_on_when_the_clock_is_set_back(skid_steer, peer, eventually) -> None:
+    """ros-controls/ros_controllers issue 101: silence until the clock has caught up."""
+    clock = peer.node.create_publisher(Clock, "/clock", 10)
+    skid_steer("-p", "use_sim_time:=true")
+    now = 1000.0
+
+    def simulate() -> None:
+        nonlocal now
+        now += 0.01
+        message = Clock()
+        message.clock.sec, message.clock.nanosec = int(now), int(now % 1 * 1e9)
+        clock.publish(message)
+        for wheel in WHEELS:
+            state = MotorState(position=now % 1000.0)
+            state.header.stamp = message.clock
+            peer.states[wheel].publish(state)
+
+    repeatedly(peer, simulate, lambda: len(peer.odometry) > 20, eventually, 20.0)
+    for jump in (-500.0, 300.0):
+        now += jump
+        before = len(peer.odometry)
+        ends = lambda before=before: len(peer.odometry) > before + 10  # noqa: E731
+        repeatedly(peer, simulate, ends, eventually, 20.0)
+        assert abs(peer.odometry[-1].header.stamp.sec - now) < 5.0
+        assert abs(peer.odometry[-1].twist.twist.linear.x) < 0.2
+
+
+def test_a_body_that_stands_has_no_speed_at_all(skid_steer, peer, eventually) -> None:
+    """ros-controls/ros2_controllers issue 1972: 5e-14 m/s for ever."""
+    skid_steer()
+    repeatedly(peer, lambda: peer.roll(2.0), lambda: len(peer.odometry) > 30, eventually)
+    peer.odometry.clear()
+    stand = lambda: peer.feed_all(3.1, 2.7)  # noqa: E731
+    repeatedly(peer, stand, lambda: len(peer.odometry) > 60, eventually)
+    last = peer.odometry[-1].twist.twist
+    assert (last.linear.x, last.angular.z) == (0.0, 0.0)
+
+
 def test_odometry_has_no_spikes_after_stalls(skid_steer, peer, eventually) -> None:
     """The reference is the speed of the wheels as they are fed: 2 rad/s, 0.2 m/s."""
     started = skid_steer()

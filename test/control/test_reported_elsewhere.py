@@ -1,0 +1,145 @@
+"""What users of other wheel drivers reported, tried on ours; each case names where."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from types import SimpleNamespace
+
+import pytest
+
+from smp_motor_control.encoder import CounterWidth, Encoder
+from smp_motor_control.motor.file import MotorEntry
+from smp_motor_control.motor.hardware import DrivenMotor, DriveSettings, Sample
+from smp_motor_control.motor.parameters import Gearbox, MotorParameters
+from smp_motor_control.pid import PidGains
+from smp_motor_control.wheel.controller import State, WheelController, WheelSettings
+from smp_motor_control.wheel.faults import Fault
+from smp_motor_control.wheel.loop import LoopSettings
+
+GAIN, RATIO = 47.6, 30.0
+GAINS = PidGains(
+    p=2.0, i=10.0, u_clamp_min=-12.0, u_clamp_max=12.0, antiwindup_strategy="back_calculation"
+)
+FED_FORWARD = PidGains(
+    p=2.0, i=10.0, u_clamp_min=-12.0, u_clamp_max=12.0, feedforward_velocity=RATIO / GAIN,
+    feedforward_static=0.6,
+)  # fmt: skip
+
+
+@dataclass
+class Wheel:
+    """A hobby gear motor under a controller: 48 counts a turn, 30 to 1, 12 V."""
+
+    settings: LoopSettings = field(default_factory=lambda: LoopSettings(gains=GAINS))
+    counts: float = 48.0
+    bits: int = 0
+    described_bits: int | None = None
+    rate: float = 100.0
+    static: float = 0.6
+    see: Callable[[Sample, float], Sample] = lambda sample, t: sample
+
+    def drive(self, target: float, seconds: float) -> WheelController:
+        """Drive at a set-point; keeps the true mean speed of the second half [rad/s]."""
+        motor = MotorParameters.from_combinations(
+            dc_gain=GAIN, time_constant=0.05, static_voltage=self.static
+        )
+        entry = MotorEntry(motor, Gearbox(RATIO), Encoder(self.counts, self.bits), 12.0)
+        bits = self.bits if self.described_bits is None else self.described_bits
+        wheel = WheelController(WheelSettings(loop=self.settings))
+        wheel.set_hardware(entry.gearbox, Encoder(self.counts, bits), 12.0)
+        plant = DrivenMotor(entry, DriveSettings(pwm_steps=255, latch=True), start=100.0)
+        wheel.activate(100.0)
+        speeds = []
+        for k in range(1, round(seconds * self.rate)):
+            now = 100.0 + k / self.rate
+            sample = self.see(plant.sample(now), now - 100.0)
+            wheel.take_setpoint(target, now)
+            stamp = round(1e9 * now)
+            answer = wheel.take_feedback(SimpleNamespace(**sample._asdict()), stamp, stamp, now)
+            wheel.tick(now)
+            if answer is not None:
+                plant.command(now, answer)
+            speeds.append(plant.motor.speed / RATIO)
+        tail = speeds[len(speeds) // 2 :]
+        self.mean, self.fastest = sum(tail) / len(tail), max(map(abs, tail))
+        return wheel
+
+
+def losing(share: float, since: float = 3.0) -> Callable[[Sample, float], Sample]:
+    """Return an encoder that shows a share of the speed from some time on."""
+    return lambda s, t: s if t < since else s._replace(velocity=share * s.velocity)
+
+
+@pytest.mark.parametrize("share", [0.2, 0.3])
+@pytest.mark.parametrize(("gains", "since"), [(GAINS, 3.0), (FED_FORWARD, 0.0)])
+def test_an_encoder_that_loses_counts_is_suspected(gains, since, share) -> None:
+    """linorobot/linorobot2 issue 154: "one of my encoder broken, so pid try to correct it"."""
+    wheel = Wheel(LoopSettings(gains=gains), see=losing(share, since)).drive(5.0, 10.0)
+    assert wheel.state is State.DRIVING and wheel.strain is not None
+    voltage, needed = wheel.strain
+    assert voltage > 11.0 and needed < 4.0
+
+
+@pytest.mark.parametrize("share", [0.0, 0.05])
+def test_an_encoder_that_shows_nothing_stops_the_wheel(share) -> None:
+    """sonyccd/roboclaw_ros issue 4: no encoder, full PWM."""
+    wheel = Wheel(see=losing(share, 0.0)).drive(5.0, 5.0)
+    assert wheel.recovery.fault in (Fault.NO_MOTION, Fault.NOT_FOLLOWING)
+
+
+@pytest.mark.parametrize("target", [0.1, 1.0, 5.0, 15.0, 25.0])
+@pytest.mark.parametrize("gains", [GAINS, FED_FORWARD])
+def test_a_sound_wheel_is_not_suspected(gains, target) -> None:
+    wheel = Wheel(LoopSettings(gains=gains)).drive(target, 8.0)
+    assert wheel.strain is None and wheel.recovery.failures == 0
+
+
+@pytest.mark.parametrize("bits", [8, 16])
+@pytest.mark.parametrize(
+    ("source", "window"), [("measured", 4), ("difference", 4), ("difference", 1)]
+)
+def test_a_counter_that_wraps_against_its_description_is_unwrapped(source, window, bits) -> None:
+    """AIRclub-UdeSA/physical_rosmaster pull request 1: counters subtracted as they are."""
+    gains = LoopSettings(gains=GAINS, speed_source=source, difference_window=window)
+    one = Wheel(gains, counts=48.0 if bits == 8 else 4000.0, bits=bits, described_bits=0)
+    wheel = one.drive(3.0, 10.0)
+    assert one.mean == pytest.approx(3.0, rel=0.02) and one.fastest < 3.5
+    assert wheel.recovery.failures == 0 and wheel.loop.wraps_at == bits
+
+
+def test_steps_that_are_no_wraps_tell_no_width() -> None:
+    width = CounterWidth()
+    counts = [0, 100, 205, 300, 100, -156, -420, -700, 40_000, 40_010, 40_021, -25_530]
+    assert [width.step(count) for count in counts[:-1]] == [0] * 11
+    assert width.step(counts[-1]) == 0, "65551 back after 11 forward leaves -15"
+    assert [CounterWidth().step(k) for k in (5, 2**40)] == [0, 0]
+
+
+@pytest.mark.parametrize("target", [0.005, 0.02, 0.1, 0.2])
+@pytest.mark.parametrize(("counts", "rate"), [(48.0, 100.0), (12.0, 50.0), (8.0, 20.0)])
+def test_a_wheel_near_zero_does_not_rocket_away(counts, rate, target) -> None:
+    """RoverRobotics-archive/roverrobotics_ros2 issue 4: near zero it drives off at top speed."""
+    one = Wheel(counts=counts, rate=rate)
+    wheel = one.drive(target, 20.0)
+    assert one.mean == pytest.approx(target, abs=0.03) and one.fastest < 1.0
+    assert wheel.recovery.failures == 0
+
+
+@pytest.mark.parametrize("window", [1, 10])
+def test_pulses_that_come_one_by_one_drive_at_the_mean_that_is_asked(window) -> None:
+    """waveshareteam/ugv_base_ros pull request 11: 0 or 1 pulse a tick, it cogs and stalls."""
+    slow = LoopSettings(gains=GAINS, speed_source="difference", difference_window=window)
+    one = Wheel(slow, counts=44.0, rate=200.0)
+    wheel = one.drive(0.25, 20.0)
+    assert one.mean == pytest.approx(0.25, rel=0.1) and wheel.recovery.failures == 0
+
+
+def test_gains_for_10_hz_of_two_unlike_motors_follow() -> None:
+    """ros-mobile-robots/diffbot issue 13: F 0.8, P 0.35, I 0.5, D 0.01, clamped, at 10 Hz."""
+    gains = PidGains(p=0.35, i=0.5, d=0.01, feedforward_velocity=0.8, i_clamp_min=-3.5,
+                     i_clamp_max=3.5, u_clamp_min=-6.0, u_clamp_max=6.0)  # fmt: skip
+    for static in (0.2, 1.0, 2.0):
+        one = Wheel(LoopSettings(gains=gains), rate=10.0, static=static)
+        wheel = one.drive(3.0, 20.0)
+        assert one.mean == pytest.approx(3.0, rel=0.02) and wheel.recovery.failures == 0
