@@ -33,7 +33,6 @@ REQUIRES = [
     "numpy>=1.26,<3",
     "scipy>=1.11",
     "numba>=0.58,<0.62",  # compiles recursions that switch with friction
-    "control>=0.10.2,<0.11",  # margins and state-space algebra of the tuning
     "threadpoolctl>=3",  # keeps linear algebra of small matrices on one thread
     "rosbags>=0.11,<0.12",  # reads and writes bags of every storage without ROS
     "mcap>=1.2,<2",  # reads on in an MCAP file whose end is missing; closes one at every flush
@@ -55,7 +54,11 @@ EXTRAS = {
     ],  # identify --fleet on a cluster, tables as Parquet
     "xlsx": ["openpyxl>=3.1"],  # Excel workbooks
     "matlab": ["h5py>=3.10"],  # MATLAB files of version 7.3
-    "test": ["pytest>=7", "hypothesis>=6"],
+    "test": [
+        "pytest>=7",
+        "hypothesis>=6",
+        "control>=0.10.2,<0.11",  # margins of the tuning are compared with its own
+    ],
 }
 
 

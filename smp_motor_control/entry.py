@@ -13,12 +13,12 @@ for _library in ("OPENBLAS", "MKL", "OMP"):
     os.environ.setdefault(f"{_library}_NUM_THREADS", "1")
 
 
-_PIP = {"yaml": "pyyaml", "mpl_toolkits": "matplotlib", "numba": "numba==0.61.2"}
+_PIP = {"yaml": "pyyaml", "numba": "numba==0.61.2"}
 """What pip calls a module otherwise."""
 
 _ROS = ("ament_index_python", "builtin_interfaces", "rcl_interfaces", "rpyutils")
 
-_OF_TOOLS = ("numpy", "scipy", "numba", "yaml", "rosbags", "mcap", "control", "msgspec", "rich")
+_OF_TOOLS = ("numpy", "scipy", "numba", "yaml", "rosbags", "mcap", "msgspec", "rich")
 """What a tool imports, some of it only while it works: looked for before it begins."""
 
 MOST_DOMAIN = 232

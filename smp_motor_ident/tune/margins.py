@@ -1,7 +1,7 @@
 """Margins of the sampled loop: phase, gain, delay and peak of the sensitivity.
 
-One nominal loop is analysed with python-control; a batch of uncertain ones by the same
-definitions on a frequency grid, all at once.
+Loops are read where their frequency response on a grid crosses unit gain and the real axis: a
+batch of uncertain ones all at once, the nominal one on a grid that is refined at its crossings.
 
 References
 ----------
@@ -11,12 +11,15 @@ References
 import math
 from dataclasses import dataclass
 
-import control
 import numpy as np
 
-from smp_motor_control.arrays import Array, Complex
+from smp_motor_control.arrays import Array, Complex, Flags
 from smp_motor_ident.tune.feedback import Feedback, spectral_radius
 from smp_motor_ident.tune.plant import Plant
+
+TINY = float(np.finfo(np.float64).tiny)
+ROUNDING = 1e-9
+"""Response [-] that stands for zero: an average over an even window has one at Nyquist."""
 
 
 @dataclass(frozen=True)
@@ -49,55 +52,80 @@ def grid_for(plant: Plant, count: int = 500) -> Array:
     return frequencies(plant.sample_time, float(np.min(motors.a0 / motors.a1)), count)
 
 
-def loop_margins(plant: Plant, feedback: Feedback) -> Margins:
-    """Return the margins of one loop, by python-control."""
-    omega = grid_for(plant, 2000)
-    loop = plant.response(omega)[0] * feedback.response(omega, plant.sample_time)
-    data = control.FRD(loop, omega, smooth=True)
-    gain, phase, least, _, crossings, _ = control.stability_margins(data, returnall=True)
-    upward = np.array([g for g in np.atleast_1d(gain) if g > 1.0])
-    phases, crossings = np.atleast_1d(phase), np.atleast_1d(crossings)
-    radius = float(spectral_radius(plant, feedback)[0])
-    worst = int(np.argmin(np.abs(phases))) if phases.size else -1
-    delays = np.deg2rad(np.where(phases < 0, phases + 360, phases)) / crossings
-    distance = float(np.min(least)) if np.size(least) else float(np.min(np.abs(1 + loop)))
-    return Margins(
-        phase=float(phases[worst]) if phases.size else math.inf,
-        gain=float(upward.min()) if upward.size else math.inf,
-        delay=float(delays.min()) if phases.size else math.inf,
-        sensitivity=1 / min(distance, float(np.min(np.abs(1 + loop)))),
-        crossover=float(crossings.max()) if phases.size else math.nan,
-        spectral_radius=radius,
-    )
-
-
 @dataclass(frozen=True, eq=False)
 class BatchMargins:
-    """The same margins for a batch of loops: arrays of shape (n,), units as in Margins."""
+    """Margins of a batch of loops: arrays of shape (n,), units as in Margins.
+
+    The phase margin is the smallest rotation, of either sign, that brings the loop to -1.
+    """
 
     phase: Array
     gain: Array
+    delay: Array
     sensitivity: Array
     crossover: Array
 
 
+def loop_margins(plant: Plant, feedback: Feedback) -> Margins:
+    """Return the margins of one loop, to six digits or better."""
+    omega = grid_for(plant, 1000)
+    for _ in range(3):
+        loop = plant.response(omega)[:1] * feedback.response(omega, plant.sample_time)
+        m = batch_margins(loop, omega)
+        omega = _refine(omega, loop[0])
+    radius = float(spectral_radius(plant, feedback)[0])
+    return Margins(
+        phase=math.copysign(float(m.phase[0]), 1 - radius),
+        gain=float(m.gain[0]),
+        delay=float(m.delay[0]),
+        sensitivity=float(m.sensitivity[0]),
+        crossover=float(m.crossover[0]),
+        spectral_radius=radius,
+    )
+
+
+def _refine(omega: Array, loop: Complex) -> Array:
+    """Return the grid, 16 times finer where a margin is read."""
+    near = _crosses_unit_gain(loop) | _crosses_real_axis(loop)
+    closest = int(np.argmin(np.abs(1 + loop)))
+    near[max(closest - 1, 0) : closest + 1] = True
+    inner = omega[:-1][near, None] + np.diff(omega)[near, None] * np.arange(1, 16) / 16
+    return np.sort(np.concatenate([omega, inner.ravel()]))
+
+
+def _crosses_unit_gain(loop: Complex) -> Flags:
+    return _changes(np.abs(loop) > 1)
+
+
+def _crosses_real_axis(loop: Complex) -> Flags:
+    return _changes(loop.imag > 0)
+
+
+def _changes(flags: Flags) -> Flags:
+    return np.asarray(flags[..., :-1] != flags[..., 1:], dtype=np.bool_)
+
+
 def batch_margins(loop: Complex, omega: Array) -> BatchMargins:
-    """Return the margins of many loops from their frequency responses."""
-    size = np.log(np.abs(loop))
-    falls = (size[:, :-1] > 0) != (size[:, 1:] > 0)
+    """Return the margins of many loops from their frequency responses on a grid up to Nyquist."""
+    falls = _crosses_unit_gain(loop)
+    size = np.log(np.maximum(np.abs(loop), TINY))
     share = size[:, :-1] / np.where(falls, size[:, :-1] - size[:, 1:], 1.0)
     # The angle from -180 deg: rotate by pi so that the principal value is the margin itself.
-    turn = np.angle(-loop)
-    step = np.angle(loop[:, 1:] / loop[:, :-1])
-    at = np.rad2deg(np.abs(turn[:, :-1] + share * step))
-    phase = np.where(falls, at, np.inf).min(axis=1)
-    where = np.where(falls, omega[:-1] + share * np.diff(omega), 0.0)
-    crosses = (loop[:, :-1].imag > 0) != (loop[:, 1:].imag > 0)
+    turn = np.angle(-loop[:, :-1]) + share * np.angle(loop[:, 1:] * loop[:, :-1].conj())
+    turn = np.where(falls, np.remainder(turn, 2 * np.pi), np.inf)  # lag that brings it to -1
+    where = np.where(falls, omega[:-1] + share * np.diff(omega), np.nan)
+    phase = np.rad2deg(np.minimum(turn, np.abs(2 * np.pi - turn)).min(axis=1))
+    delay = np.where(falls, turn / where, np.inf).min(axis=1)
+    crossover = np.fmax.reduce(where, axis=1)  # NaN where there is none
+    crosses = _crosses_real_axis(loop)
     part = loop[:, :-1].imag / np.where(crosses, loop[:, :-1].imag - loop[:, 1:].imag, 1.0)
     real = loop[:, :-1].real + part * np.diff(loop.real, axis=1)
     # At Nyquist the response of a sampled loop is real: a crossing of its own.
     real = np.concatenate([np.where(crosses, real, 0.0), loop[:, -1:].real], axis=1)
-    below = (real < 0) & (real > -1)
+    below = (real < -ROUNDING) & (real > -1)
     gain = np.where(below, -1 / np.where(below, real, -1.0), np.inf).min(axis=1)
-    distance = np.abs(1 + loop).min(axis=1)
-    return BatchMargins(phase, gain, 1 / distance, where.max(axis=1))
+    # The Nyquist curve's distance from -1, by its chords.
+    start, chord = 1 + loop[:, :-1], np.diff(loop, axis=1)
+    nearest = -(start * chord.conj()).real / np.maximum(np.abs(chord) ** 2, TINY)
+    distance = np.abs(start + np.clip(nearest, 0.0, 1.0) * chord).min(axis=1)
+    return BatchMargins(phase, gain, delay, 1 / distance, crossover)
