@@ -35,9 +35,8 @@ REQUIRES = [
     "numba>=0.58,<0.62",  # compiles recursions that switch with friction
     "threadpoolctl>=3",  # keeps linear algebra of small matrices on one thread
     "rosbags>=0.11,<0.12",  # reads and writes bags of every storage without ROS
-    "mcap>=1.2,<2",  # reads on in an MCAP file whose end is missing; closes one at every flush
     "lz4>=4",  # unpacks chunks and files of bags
-    "zstandard>=0.22",  # unpacks chunks, messages and files of bags
+    "backports.zstd>=1; python_version < '3.14'",  # unpacks chunks, messages and files of bags
     "msgspec>=0.19,<1",  # reads identification.json into the types of result.py
     "jinja2>=3.1",  # templates of the pages
     "rich>=13",  # progress and tables in the terminal
@@ -47,6 +46,7 @@ EXTRAS = {
     "ros": [  # what the nodes need, as wheels, where no ROS 2 Jazzy is sourced
         "ros-jazzy-rclpy[fastrtps]",
         "ros-jazzy-common-interfaces",
+        "mcap>=1.2,<2",  # writes bags that are closed at every flush
     ],
     "fleet": [
         "distributed>=2024",
@@ -57,6 +57,7 @@ EXTRAS = {
     "test": [
         "pytest>=7",
         "hypothesis>=6",
+        "mcap>=1.2,<2",
         "control>=0.10.2,<0.11",  # margins of the tuning are compared with its own
     ],
 }

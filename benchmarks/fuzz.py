@@ -37,7 +37,7 @@ import numpy as np
 import openpyxl
 import scipy.io
 import yaml
-import zstandard
+from backports import zstd
 from rosbags.rosbag1 import Writer as Ros1Writer
 from rosbags.typesys import Stores, get_typestore
 
@@ -241,7 +241,7 @@ SEEDS: dict[str, tuple[str, Callable[[], bytes], list[str] | None]] = {
     "mcap": ("a.mcap", lambda: _mcap("NONE"), MESSAGES),
     "mcap zstd": ("a.mcap", lambda: _mcap("ZSTD"), MESSAGES),
     "mcap lz4": ("a.mcap", lambda: _mcap("LZ4"), MESSAGES),
-    "mcap.zstd": ("a.mcap.zstd", lambda: zstandard.compress(_mcap("NONE")), MESSAGES),
+    "mcap.zstd": ("a.mcap.zstd", lambda: zstd.compress(_mcap("NONE")), MESSAGES),
     "mcap.lz4": ("a.mcap.lz4", lambda: lz4.frame.compress(_mcap("NONE")), MESSAGES),
     "sqlite": ("a.db3", _sqlite, MESSAGES),
     "ros1": ("a.bag", lambda: _ros1(None), MESSAGES),

@@ -18,7 +18,7 @@ _PIP = {"yaml": "pyyaml", "numba": "numba==0.61.2"}
 
 _ROS = ("ament_index_python", "builtin_interfaces", "rcl_interfaces", "rpyutils")
 
-_OF_TOOLS = ("numpy", "scipy", "numba", "yaml", "rosbags", "mcap", "msgspec", "rich")
+_OF_TOOLS = ("numpy", "scipy", "numba", "yaml", "rosbags", "msgspec", "rich")
 """What a tool imports, some of it only while it works: looked for before it begins."""
 
 MOST_DOMAIN = 232
@@ -110,11 +110,11 @@ def wrong_domain() -> str:
     return f"ROS_DOMAIN_ID is {domain!r}; it must be a whole number from 0 to {MOST_DOMAIN}"
 
 
-def _tool(name: str) -> Callable[[], int]:
+def _tool(name: str, *more: str) -> Callable[[], int]:
     program = _program(f"smp_motor_ident.cli.{name}", 130)
 
     def run() -> int:
-        for module in _OF_TOOLS:
+        for module in (*_OF_TOOLS, *more):
             if importlib.util.find_spec(module) is None:
                 print(f"{name}: {missing(ModuleNotFoundError(name=module))}", file=sys.stderr)
                 return 2
@@ -134,5 +134,5 @@ play = node("play", "smp_motor_ident")
 identifier = node("identifier", "smp_motor_ident")
 identify = _tool("identify")
 tune = _tool("tune")
-commission = _tool("commission")
-demo = _tool("demo")
+commission = _tool("commission", "mcap")
+demo = _tool("demo", "mcap")

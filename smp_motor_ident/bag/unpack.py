@@ -17,7 +17,7 @@ from typing import Any
 
 import lz4.frame
 import numpy as np
-import zstandard
+from backports import zstd  # from Python 3.14 on: compression.zstd
 
 from smp_motor_ident.bag.limits import UNPACKED_LEAST, UNPACKED_RATIO
 from smp_motor_ident.bag.storage import Batch, gather, join
@@ -25,10 +25,14 @@ from smp_motor_ident.errors import BagError
 
 VARIABLE = "SMP_BAG_UNPACKED"
 MAGIC = {b"\x28\xb5\x2f\xfd": "zstd", b"\x04\x22\x4d\x18": "lz4"}
-_FED = 1024  # bytes fed at once: the largest block of zstd, 128 KiB, may be packed in four bytes
+_FED = 1024  # bytes fed at once: so many take along what came out before damage among them
 _PIECE = 1 << 20
-_DAMAGE = (zstandard.ZstdError, RuntimeError, EOFError, OSError, ValueError)
-_ZSTD = zstandard.ZstdDecompressor()
+_DAMAGE = (zstd.ZstdError, RuntimeError, EOFError, OSError, ValueError)
+_ENGINES = {
+    "zstd": zstd.ZstdDecompressor,
+    "lz4": lz4.frame.LZ4FrameDecompressor,
+    "bz2": bz2.BZ2Decompressor,
+}
 
 
 class Budget:
@@ -76,40 +80,23 @@ def pieces(blocks: Iterable[bytes], kind: str) -> Iterator[bytes]:
             rest = block[k : k + _FED]
             while rest:
                 if engine is None or engine.eof:  # another frame follows
-                    engine = _engine(kind)
-                if kind == "zstd":
-                    yield engine.decompress(rest)
-                else:
-                    yield engine.decompress(rest, _PIECE)
-                    while not (engine.eof or engine.needs_input):
-                        yield engine.decompress(b"", _PIECE)
+                    engine = _ENGINES[kind]()
+                yield engine.decompress(rest, _PIECE)
+                while not (engine.eof or engine.needs_input):
+                    yield engine.decompress(b"", _PIECE)
                 rest = engine.unused_data if engine.eof else b""
     if engine is None or not engine.eof:
         raise EOFError("cut off")
 
 
-def _engine(kind: str) -> Any:
-    if kind == "zstd":
-        return _ZSTD.decompressobj()
-    return lz4.frame.LZ4FrameDecompressor() if kind == "lz4" else bz2.BZ2Decompressor()
-
-
-def decompress(data: bytes, compression: str, size: int, budget: Budget) -> bytes:
+def decompress(data: bytes, compression: str, budget: Budget) -> bytes:
     """Decompress a block, or what can be had of one that is cut off."""
     if compression in ("", "none"):
         return data
-    if compression not in ("zstd", "lz4", "bz2"):
+    if compression not in _ENGINES:
         raise BagError(f"compression {compression!r} is not supported; use zstd, lz4 or bz2")
     parts: list[bytes] = []
     try:
-        if compression == "zstd":
-            whole = zstandard.get_frame_parameters(data).content_size
-            if 0 < whole <= max(size, _PIECE):
-                budget.take(whole)
-                try:
-                    return _ZSTD.decompress(data, allow_extra_data=False)
-                except zstandard.ZstdError:
-                    budget.left += whole  # cut off, or not the only frame: take what comes
         for piece in pieces([data], compression):
             budget.take(len(piece))
             parts.append(piece)
@@ -148,7 +135,7 @@ def decompress_messages(batch: Batch, budget: Budget) -> tuple[Batch, int]:
     blobs = []
     for k in range(len(batch)):
         kind = next((kind for kind, which in packed.items() if which[k]), "")
-        blobs.append(decompress(batch.message(k), kind, 0, budget))
+        blobs.append(decompress(batch.message(k), kind, budget))
     kept = np.array([bool(blob) for blob in blobs])
     joined = join(batch.channel, [b for b in blobs if b], batch.log_time[kept])
     if batch.sequence is not None:

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 from packaging.requirements import Requirement
+from packaging.utils import canonicalize_name
 
 ROOT = Path(__file__).resolve().parents[2]
 PACKAGES = ("smp_motor_control/", "smp_motor_ident/")
@@ -61,11 +62,15 @@ def test_every_requirement_is_pinned_within_its_range(lock, monkeypatch):
         for line in (ROOT / "requirements" / name).read_text().splitlines():
             if line and line[0] not in " #":
                 pin = Requirement(line.removesuffix("\\"))
-                pins.setdefault(pin.name, []).append(str(pin.specifier).removeprefix("=="))
+                pins.setdefault(canonicalize_name(pin.name), []).append(
+                    str(pin.specifier).removeprefix("==")
+                )
     extras = ("xlsx", "matlab") if lock == "jazzy.txt" else ("xlsx", "matlab", "ros")
     for text in [
         *given["install_requires"],
         *(t for e in extras for t in given["extras_require"][e]),
     ]:
         wanted = Requirement(text)
-        assert any(version in wanted.specifier for version in pins.get(wanted.name, ())), text
+        assert any(
+            version in wanted.specifier for version in pins.get(canonicalize_name(wanted.name), ())
+        ), text

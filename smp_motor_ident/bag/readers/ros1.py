@@ -58,7 +58,7 @@ class _Ros1Bag(Messages):
                 if kind == RecordType.CHUNK:
                     packed = _COMPRESSION.get(header.get_string("compression"), "?")
                     whole = header.get_uint32("size")
-                    data = decompress(file.read(length), packed, whole, self._budget)
+                    data = decompress(file.read(length), packed, self._budget)
                     if len(data) != whole:
                         self._amiss(f"the chunk at byte {start} is damaged; its rest is left out")
                     yield from self._walk(io.BytesIO(data), len(data), wanted, inside=True)

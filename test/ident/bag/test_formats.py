@@ -14,7 +14,7 @@ from types import SimpleNamespace
 import lz4.frame
 import mcap.writer
 import pytest
-import zstandard
+from backports import zstd
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 
 from smp_motor_ident.bag import list_topics, read_records
@@ -23,7 +23,7 @@ from smp_motor_ident.errors import BagError
 Pack = Callable[[bytes], bytes]
 PACKERS: dict[str, Pack] = {
     "plain": bytes,
-    "zstd": zstandard.ZstdCompressor().compress,
+    "zstd": zstd.compress,
     "lz4": lz4.frame.compress,
 }
 

@@ -1,0 +1,163 @@
+"""Records that describe an MCAP file, in the layout of https://mcap.dev/spec.
+
+A record that ends early, or whose text is not UTF-8, raises one of `DAMAGE`.
+"""
+
+import io
+import struct
+from typing import BinaryIO, NamedTuple
+
+MAGIC = b"\x89MCAP0\r\n"
+FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK, CHUNK_INDEX = 2, 3, 4, 5, 6, 8
+STATISTICS, DATA_END = 11, 15
+HEAD = struct.Struct("<BQ")  # every record's opcode and length in bytes
+DAMAGE = (struct.error, ValueError, OverflowError)
+_FOOTER = struct.Struct("<BQQQI")  # with its head
+
+
+class Schema(NamedTuple):
+    """The definition of a message type."""
+
+    id: int
+    name: str
+    encoding: str
+    data: bytes
+
+
+class Channel(NamedTuple):
+    """A topic."""
+
+    id: int
+    schema: int
+    topic: str
+    encoding: str
+    metadata: dict[str, str]
+
+
+class Chunk(NamedTuple):
+    """The head of a chunk: where its messages begin and how they are compressed."""
+
+    size: int  # uncompressed [bytes]
+    crc: int  # of the uncompressed bytes; 0 if absent
+    compression: str
+    begin: int
+    stored: int  # compressed [bytes]
+
+
+class ChunkIndex(NamedTuple):
+    """Where a chunk begins in the file, its channels and its number of messages."""
+
+    start: int
+    channels: tuple[int, ...]
+    messages: int
+
+
+class Summary(NamedTuple):
+    """The summary section of a file that was closed."""
+
+    schemas: dict[int, Schema]
+    channels: list[Channel]
+    counts: dict[int, int]  # messages by channel
+    chunks: dict[int, ChunkIndex]  # by where they begin
+
+
+class _Fields:
+    """Reads the fields of a record in their order."""
+
+    def __init__(self, data: bytes) -> None:
+        self._data = data
+        self.at = 0
+
+    def numbers(self, kinds: str) -> tuple[int, ...]:
+        found = struct.unpack_from("<" + kinds, self._data, self.at)
+        self.at += struct.calcsize("<" + kinds)
+        return found
+
+    def block(self) -> bytes:
+        (length,) = self.numbers("I")
+        begin, self.at = self.at, self.at + length
+        if self.at > len(self._data):
+            raise ValueError("a record ends early")
+        return self._data[begin : self.at]
+
+    def text(self) -> str:
+        return self.block().decode()
+
+
+def read_schema(body: bytes) -> Schema:
+    """Read a schema."""
+    fields = _Fields(body)
+    (key,) = fields.numbers("H")
+    return Schema(key, fields.text(), fields.text(), fields.block())
+
+
+def read_channel(body: bytes) -> Channel:
+    """Read a channel."""
+    fields = _Fields(body)
+    key, schema = fields.numbers("HH")
+    topic, encoding, held = fields.text(), fields.text(), fields.block()
+    pairs, metadata = _Fields(held), dict[str, str]()
+    while pairs.at < len(held):
+        name = pairs.text()
+        metadata[name] = pairs.text()
+    return Channel(key, schema, topic, encoding, metadata)
+
+
+def read_chunk(body: bytes) -> Chunk:
+    """Read the head of a chunk, whose messages may be cut off."""
+    fields = _Fields(body)
+    _, _, size, crc = fields.numbers("QQQI")
+    compression, (stored,) = fields.text(), fields.numbers("Q")
+    return Chunk(size, crc, compression, fields.at, stored)
+
+
+def read_chunk_index(body: bytes) -> ChunkIndex:
+    """Read the index of a chunk."""
+    fields = _Fields(body)
+    _, _, start, _ = fields.numbers("QQQQ")
+    channels = tuple(key for key, _ in struct.iter_unpack("<HQ", fields.block()))
+    (length,) = fields.numbers("Q")
+    # Behind a chunk, each channel's index record is 15 bytes and 16 per message.
+    return ChunkIndex(start, channels, (length - 15 * len(channels)) // 16)
+
+
+def read_statistics(body: bytes) -> tuple[int, dict[int, int]]:
+    """Read the number of channels, and the number of messages by channel."""
+    fields = _Fields(body)
+    _, _, channels, _, _, _, _, _ = fields.numbers("QHIIIIQQ")
+    return channels, dict(struct.iter_unpack("<HQ", fields.block()))
+
+
+def read_summary(file: BinaryIO) -> Summary | None:
+    """Return the summary, or None unless it counts the messages and repeats the channels."""
+    bodies: dict[int, list[bytes]] = {SCHEMA: [], CHANNEL: [], CHUNK_INDEX: [], STATISTICS: []}
+    end = file.seek(0, io.SEEK_END) - _FOOTER.size - len(MAGIC)
+    if end < len(MAGIC):
+        return None
+    file.seek(end)
+    op, _, at, _, _ = _FOOTER.unpack(file.read(_FOOTER.size))
+    if op != FOOTER or not at or file.read(len(MAGIC)) != MAGIC:
+        return None
+    while at < end:
+        file.seek(at)
+        op, length = HEAD.unpack(file.read(HEAD.size))
+        at += HEAD.size + length
+        if at > end:
+            return None
+        if op in bodies:
+            bodies[op].append(file.read(length))
+    try:
+        schemas = [read_schema(body) for body in bodies[SCHEMA]]
+        channels = [read_channel(body) for body in bodies[CHANNEL]]
+        chunks = [read_chunk_index(body) for body in bodies[CHUNK_INDEX]]
+        statistics = [read_statistics(body) for body in bodies[STATISTICS]]
+    except DAMAGE:
+        return None
+    if not statistics or statistics[-1][0] != len({channel.id for channel in channels}):
+        return None
+    return Summary(
+        {schema.id: schema for schema in schemas},
+        channels,
+        statistics[-1][1],
+        {chunk.start: chunk for chunk in chunks},
+    )
