@@ -136,7 +136,7 @@ def test_a_drift_is_no_winding() -> None:
     assert said.severity == "warning" and "a load's that settles" in said.message
     assert "counts" not in said.advice  # which are what was recorded
     q = found.combinations["time_constant"]
-    assert q.value > 1.0 and q.ci95[0] < lag
+    assert q.value > 1.0 and q.total_ci95[0] < lag
 
 
 def test_a_motor_that_rings_has_a_winding_and_no_filter() -> None:

@@ -226,13 +226,13 @@ def test_coarse_counts_cost_no_more_than_the_limits_ask_for():
 
 def test_command_refuses_an_unreliable_result_unless_it_is_accepted(tmp_path, capsys):
     source, output = tmp_path / "identification.json", tmp_path / "gains.yaml"
-    source.write_text(json.dumps(identification_document({"": estimate(findings=[DOUBT])})))
+    source.write_text(json.dumps(identification_document({"left": estimate(findings=[DOUBT])})))
     assert tune([str(source), "--output", str(output)]) == 1
     assert "a dead zone of 2 V" in capsys.readouterr().err
     assert not output.exists()
     assert tune([str(source), "--output", str(output), "--accept-unreliable"]) == 0
     assert "designed on an unreliable identification" in capsys.readouterr().out
-    entry = json.loads(output.with_suffix(".json").read_text())["wheels"][""]
+    entry = json.loads(output.with_suffix(".json").read_text())["wheels"]["left"]
     assert entry["findings"][0]["code"] == "unreliable_identification"
     for name in ("overshoot", "settling", "phase_margin", "gain_margin", "sensitivity"):
         band = entry["specification"][name]
