@@ -135,9 +135,18 @@ class Browser:
         answer = self.ask("Runtime.evaluate", expression=expression, returnByValue=True)
         return answer["result"].get("value")
 
-    def picture(self, path: Path) -> None:
-        """Write what is shown as PNG, the whole page."""
+    def picture(self, path: Path, *selectors: str, margin: int = 12) -> None:
+        """Write the page as PNG, or the part of it that holds the elements of the selectors."""
         size = self.ask("Page.getLayoutMetrics")["cssContentSize"]
-        clip = {**{k: size[k] for k in ("x", "y", "width", "height")}, "scale": 1}
+        left, top, right, bottom = size["x"], size["y"], size["width"], size["height"]
+        if selectors:
+            rect = "document.querySelector({!r}).getBoundingClientRect().toJSON()"
+            rects = [self.value(rect.format(selector)) for selector in selectors]
+            scrolled = self.value("scrollY")
+            left = max(left, min(r["left"] for r in rects) - margin)
+            right = min(right, max(r["right"] for r in rects) + margin)
+            top = max(top, min(r["top"] for r in rects) + scrolled - margin)
+            bottom = min(bottom, max(r["bottom"] for r in rects) + scrolled + margin)
+        clip = {"x": left, "y": top, "width": right - left, "height": bottom - top, "scale": 1}
         shot = self.ask("Page.captureScreenshot", clip=clip, captureBeyondViewport=True)
         path.write_bytes(base64.b64decode(shot["data"]))

@@ -1,0 +1,99 @@
+"""Draw the pictures of the pages: ``make pictures``, which takes six minutes.
+
+The simulated robot is identified, tuned, driven and commissioned; headless Chromium shows the pages
+that this writes. An argument names a folder in which an earlier run's results are, or will be kept.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from PIL import Image
+
+ROOT = Path(__file__).resolve().parent.parent
+FIGURES = ROOT / "docs" / "figures"
+sys.path.insert(0, str(ROOT / "test"))
+
+from browser import CHROMIUM, Browser  # noqa: E402
+
+from smp_motor_control.nodes import loopback  # noqa: E402
+
+DOMAIN = "87"
+"""ROS domain of the simulated robot, where none is set."""
+WIDTH = 1280
+"""Of the window [px]."""
+COLOURS = 48
+"""Of a picture: charts and text need no more, and a picture stays below 100 kB."""
+PARTS = {
+    "report": ("tuned/report.html", ("#front_left",)),
+    "tuning": ("tuned/report.html", ("#tuning h2", "#figure-tuning-step", "#figure-tuning-load")),
+    "commissioning": ("trial/report.html", ("h1", "#results")),
+}
+"""Per picture the page, and the first and last of its parts that are shown."""
+
+
+@contextmanager
+def running(*command: str) -> Iterator[None]:
+    """Run a command until the block ends."""
+    process = subprocess.Popen(command)
+    try:
+        yield
+    finally:
+        process.send_signal(signal.SIGINT)
+        process.wait(timeout=30)
+
+
+def prepare(folder: Path) -> None:
+    """Write the results that the pictures show, unless the folder holds them."""
+
+    def run(*command: str) -> None:
+        print("pictures:", *command, flush=True)
+        subprocess.run(command, cwd=folder, check=True, stdout=subprocess.DEVNULL)
+
+    os.environ.update({"ROS_DOMAIN_ID": DOMAIN, **loopback.environment(), **os.environ})
+    folder.mkdir(parents=True, exist_ok=True)
+    if not (folder / "demo").exists():
+        run("demo", "--output", "demo")
+    if not (folder / "tuned").exists():
+        run("identify", "demo/excitation", "--output", "tuned", "--tuning")
+    if not (folder / "trial").exists():
+        with running("motor_plant"):
+            run("commission", "--output", "trial", "--amplitude", "6", "--yes")
+
+
+def draw(folder: Path) -> None:
+    """Write every picture."""
+    shutil.copy(folder / "demo" / "drive.svg", FIGURES / "drive.svg")
+    with tempfile.TemporaryDirectory() as profile, Browser(Path(profile)) as browser:
+        for name, (page, parts) in PARTS.items():
+            browser.open(folder / page, WIDTH)
+            path = FIGURES / f"{name}.png"
+            browser.picture(path, *parts)
+            with Image.open(path) as shot:
+                drawn = shot.convert("RGB").quantize(COLOURS, dither=Image.Dither.NONE)
+            drawn.save(path, optimize=True)
+            print(f"pictures: {path.relative_to(ROOT)}: {path.stat().st_size / 1e3:.0f} kB")
+
+
+def main(arguments: list[str]) -> int:
+    """Write all pictures, or say what is missing."""
+    if not CHROMIUM:
+        print("pictures: no Chromium found: apt install chromium", file=sys.stderr)
+        return 1
+    with tempfile.TemporaryDirectory() as temporary:
+        folder = Path(arguments[0] if arguments else temporary).resolve()
+        prepare(folder)
+        draw(folder)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))
