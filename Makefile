@@ -1,10 +1,10 @@
-# make setup | demo | test | check | docs | paper | clean. Each but clean sets up first, which is skipped when it is done.
-# PYTHON=/path/to/python3 chooses the Python (3.10 to 3.13); ARGS="..." is passed on to demo, test and paper.
+# make setup | demo | test | check | docs | pictures | paper | clean. Each but clean sets up first, which is skipped when it is done.
+# PYTHON=/path/to/python3 chooses the Python (3.10 to 3.13); ARGS="..." is passed on to demo, test, pictures and paper.
 SHELL := bash
 ROOT := $(patsubst %/,%,$(dir $(abspath $(lastword $(MAKEFILE_LIST)))))
 IN := cd '$(ROOT)' && . ./setup.bash &&
 
-.PHONY: setup demo test check format docs paper lock clean
+.PHONY: setup demo test check format docs pictures paper lock clean
 
 setup:
 	@PYTHON='$(PYTHON)' '$(ROOT)/scripts/setup.sh'
@@ -31,7 +31,11 @@ format: setup
 	@$(IN) ruff format && ruff check --fix
 
 docs: setup
-	@$(IN) sphinx-build -q docs docs/_build/html && echo "docs: $(ROOT)/docs/_build/html/README.html"
+	@$(IN) sphinx-build -q docs docs/_build/html && echo "docs: $(ROOT)/docs/_build/html/index.html"
+
+# Draw the pictures of the pages anew (minutes; needs Chromium).
+pictures: setup
+	@$(IN) exec python scripts/pictures.py $(ARGS)
 
 paper: setup
 	@$(IN) exec python benchmarks/paper.py $(ARGS)

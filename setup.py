@@ -167,10 +167,12 @@ setup(
         (f"share/{NAME}/launch", glob("launch/*.launch.py")),
         (f"share/{NAME}/config", glob("config/*")),
         *(
-            (f"share/{NAME}/{d}", glob(f"{d}/*.md"))
-            for d in ("docs", "docs/howto", "docs/decisions")
+            (f"share/{NAME}/{folder}", glob(f"{folder}/*.md"))
+            for folder in sorted(
+                {str(Path(page).parent) for page in glob("docs/**/*.md", recursive=True)}
+            )
         ),
-        (f"share/{NAME}/docs/figures", glob("docs/figures/*.svg")),
+        (f"share/{NAME}/docs/figures", glob("docs/figures/*")),
     ],
     install_requires=REQUIRES,
     extras_require=EXTRAS,

@@ -1,7 +1,8 @@
 """Every command that is printed is run, or is marked with what it needs and names what exists.
 
 A fence is ``bash`` where its commands run here, page by page in their order, and ``sh`` where they
-need what tests have not: its first line says what.
+need what tests have not: its first line says what. ``output`` is what the fence before it prints,
+and the ``python`` of a tutorial runs in its place.
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ import numpy as np
 import pytest
 import rclpy
 import yaml
+from printed import not_printed
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from smp_motor_control import WHEELS
@@ -47,15 +49,15 @@ PARSERS = {
 }
 NODES = ("wheel_pid", "motor_plant", "skid_steer", "teleop_wheels", "excite", "serial_driver",
          "record", "play", "identifier")  # fmt: skip
-LANGUAGES = {"bash", "sh", "python", "yaml", "xml", "json", "cpp", "text", "", "{toctree}",
-             "{eval-rst}"}  # fmt: skip
+LANGUAGES = {"bash", "sh", "python", "output", "yaml", "xml", "json", "cpp", "text", "",
+             "{toctree}", "{include}", "{eval-rst}"}  # fmt: skip
 
 
 def blocks(page: str) -> Iterator[tuple[str, list[str]]]:
     """Return language and lines of each fence of a page."""
     inside = None
     for line in (ROOT / page).read_text(encoding="utf-8").splitlines():
-        if inside is None and (fence := re.match(r"\s*```([\w{}-]*)\s*$", line)):
+        if inside is None and (fence := re.match(r"\s*```([\w{}-]*)[\w ./-]*$", line)):
             inside = (fence[1], [])
         elif inside is not None and line.strip() == "```":
             yield inside
@@ -259,13 +261,20 @@ def test_commands_run_in_the_order_of_their_page(page, inputs, tmp_path, monkeyp
         if entry.name not in made:
             (tmp_path / entry.name).symlink_to(entry)
     monkeypatch.chdir(tmp_path)
+    printed: list[str] = []
     for name, lines in blocks(page):
-        if name != "bash":
-            continue
-        for words in commands(lines):
-            assert words[0] in TOOLS, f"{page}: {words[0]} does not run here; mark the block sh"
-            code = TOOLS[words[0]](words[1:])
-            assert code == 0, f"{page}: {shlex.join(words)}: {capsys.readouterr().err}"
+        if name == "python" and page.startswith("docs/tutorial/"):
+            exec(compile("\n".join(lines), page, "exec"), {})
+        elif name == "output":
+            assert not_printed(lines, printed) == [], "\n".join(printed)
+        elif name == "bash":
+            capsys.readouterr()
+            for words in commands(lines):
+                assert words[0] in TOOLS, f"{page}: {words[0]} does not run here; mark the block sh"
+                code = TOOLS[words[0]](words[1:])
+                out, err = capsys.readouterr()
+                assert code == 0, f"{page}: {shlex.join(words)}: {err}"
+                printed = out.splitlines()
 
 
 def test_the_driver_of_the_page_publishes_what_its_board_counts_and_obeys():
@@ -383,7 +392,7 @@ def test_the_page_of_nodes_is_what_the_nodes_say():
 
 
 def test_our_names_in_the_table_of_ros2_controllers_are_parameters():
-    text = (ROOT / "docs/howto/ros2-controllers.md").read_text()
+    text = (ROOT / "docs/ros2-controllers.md").read_text()
     topics = set(re.findall(r"`([\w/<>~]+)`", (ROOT / "docs/nodes.md").read_text())) | {"/tf"}
     names = known("skid_steer"), known("wheel_pid"), topics
     for there, part in zip(names, text.split("\n## ")[1:], strict=True):

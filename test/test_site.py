@@ -1,0 +1,70 @@
+"""The documentation as its readers meet it: one index, every page within a telephone's width."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from browser import CHROMIUM, Browser
+
+pytest.importorskip("furo", reason="the documentation's tools are not installed")
+
+ROOT = Path(__file__).resolve().parents[1]
+FIGURES = ROOT / "docs" / "figures"
+SIZE_OF_FIGURES = 1_000_000
+"""Bytes: a clone stays small."""
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Build the site as `make docs` does; a broken link or a page without a place is an error."""
+    folder = tmp_path_factory.mktemp("site")
+    command = [sys.executable, "-m", "sphinx", "-q", "-W", "--keep-going", "docs", folder]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    return folder
+
+
+@pytest.fixture(scope="module")
+def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
+    if not CHROMIUM:
+        pytest.skip("no Chromium on this machine")
+    with Browser(tmp_path_factory.mktemp("profile")) as opened:
+        yield opened
+
+
+def test_index_holds_the_readme_and_every_section(site: Path) -> None:
+    page = (site / "index.html").read_text()
+    first = (ROOT / "README.md").read_text().split("\n\n")[1]
+    assert first.split(".")[0].replace("\n", " ") in page.replace("\n", " ")
+    captions = re.findall(r'class="caption-text">([^<]+)<', page)
+    sections = ["Tutorials", "How-to", "Reference", "Explanation", "Results"]
+    assert list(dict.fromkeys(captions)) == sections
+
+
+@pytest.mark.parametrize("width", [390, 1280])
+def test_no_page_scrolls_sideways(site: Path, browser: Browser, width: int) -> None:
+    wide = {}
+    pages = sorted(p for p in site.rglob("*.html") if "_static" not in p.parts)
+    assert len(pages) > 30
+    for page in pages:
+        browser.open(page, width)
+        scrolled = browser.value("document.documentElement.scrollWidth")
+        if scrolled > width:
+            wide[page.relative_to(site)] = scrolled
+    assert wide == {}
+    assert browser.complaints == []
+    assert [url for url in browser.requests if not url.startswith(("file:", "data:"))] == []
+
+
+def test_figures_are_small_and_each_is_shown() -> None:
+    figures = [path for path in FIGURES.iterdir() if path.is_file()]
+    assert sum(path.stat().st_size for path in figures) < SIZE_OF_FIGURES
+    pages = [ROOT / "README.md", *(ROOT / "docs").rglob("*.md")]
+    text = "".join(path.read_text() for path in pages if "_build" not in path.parts)
+    shown = set(re.findall(r"figures/([\w.]+)\)", text))
+    assert {path.name for path in figures} == shown
