@@ -6,6 +6,7 @@ code with estimator and designer; identification and design are the project's ow
 
 from __future__ import annotations
 
+import argparse
 import sys
 from dataclasses import dataclass
 from pathlib import Path
@@ -292,7 +293,10 @@ def say(text):
 
 def main():
     """Write the page."""
-    folder = ROOT / "docs" / "figures"
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--output", type=Path, default=ROOT / "docs", help="folder of the page")
+    output = parser.parse_args().output
+    folder = output / "figures"
     folder.mkdir(parents=True, exist_ok=True)
     found = identify()
     say("Table 2 in continuous and sampled time")
@@ -332,8 +336,8 @@ def main():
         rate=f"{OUR_RATE:g}",
         seconds=f"{SECONDS:g}",
     )
-    (ROOT / "docs" / "paper.md").write_text(page, encoding="utf-8")
-    say("written: docs/paper.md")
+    (output / "paper.md").write_text(page, encoding="utf-8")
+    say(f"written: {output / 'paper.md'}")
     return 0
 
 

@@ -22,7 +22,7 @@ import numpy as np
 import pytest
 import rclpy
 import yaml
-from printed import not_printed
+from printed import agree, not_printed
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from smp_motor_control import WHEELS
@@ -389,6 +389,17 @@ def test_the_page_of_nodes_is_what_the_nodes_say():
     )
     page = (ROOT / "docs/nodes.md").read_text()
     assert page == made.stdout, "python scripts/nodes.py > docs/nodes.md"
+
+
+@pytest.mark.slow
+def test_the_page_of_the_paper_is_what_its_command_computes(tmp_path):
+    command = [sys.executable, ROOT / "benchmarks/paper.py", "--output", tmp_path]
+    subprocess.run(command, check=True, capture_output=True)
+    shown, fresh = (
+        (folder / "paper.md").read_text().splitlines() for folder in (ROOT / "docs", tmp_path)
+    )
+    stale = [a for a, b in zip(shown, fresh, strict=True) if not agree(a, b)]
+    assert stale == [], "make paper"
 
 
 def test_our_names_in_the_table_of_ros2_controllers_are_parameters():

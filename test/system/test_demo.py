@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 import re
 import signal
@@ -14,11 +15,14 @@ from typing import Any
 from xml.etree import ElementTree
 
 import pytest
+from printed import numbers, shape
 
 from smp_motor_control import WHEELS
 from smp_motor_control.motor.file import load_motors
 from smp_motor_ident.bag import read_records
 from smp_motor_ident.cli.applying import from_file
+
+PAGE = Path(__file__).resolve().parents[2] / "docs" / "tutorial" / "simulated-robot.md"
 
 LIMIT = 150.0
 """What the demo may take [s] on two cores that are its own."""
@@ -48,6 +52,35 @@ def mark() -> Iterator[str]:
         os.kill(pid, signal.SIGKILL)
 
 
+def assert_page_shows(output: str) -> None:
+    """Compare the page's excerpt with a run: another run scatters as its deviations say."""
+    shown = [line for line in PAGE.read_text().split("```text\n")[1].split("```")[0].splitlines()
+             if line.strip()]  # fmt: skip
+    fresh = [line for line in output.split("Front left: ")[1].split("Front right: ")[0].splitlines()
+             if line.strip()]  # fmt: skip
+    fresh[0] = f"Front left: {fresh[0]}"
+    fresh += [line for line in output.splitlines() if line.startswith("ok ")]
+    for a, b in zip(shown, fresh, strict=True):
+        # Which wheel a limit is nearest to is chance.
+        where = re.compile(r" \((-|\w+( \w+)?)\)$")
+        assert shape(where.sub("", a.rstrip())) == shape(where.sub("", b.rstrip()))
+        one, other = numbers(a), numbers(b)
+        if "error/std" in a or not one:
+            continue
+        if re.match(r" [a-z_]+ +[-\d.e]+ +[-\d.e]+ +[-\d.e]+ +[+-]", a):
+            assert one[0] == other[0], f"{a}: the true motor is {other[0]}"
+            assert abs(one[1] - other[1]) < 5 * math.hypot(one[2], other[2]), (a, b)
+            # A deviation is an estimate, too: those of R and K differ threefold between runs.
+            assert 0.2 < one[2] / other[2] < 5.0, (a, b)
+        elif a.startswith("gains"):
+            # Motors that are known to 0.1 % have gains within 2 % (docs/benchmarks/tuning.md).
+            assert one == pytest.approx(other, rel=0.02), (a, b)
+        elif " ms " in a:
+            # The demo's own limits: 20 ms of settling, 2 % of overshoot.
+            assert one[1:3] == pytest.approx(other[1:3], abs=20.0), (a, b)
+            assert one[3:] == pytest.approx(other[3:], abs=2.0), (a, b)
+
+
 @pytest.mark.alone
 @pytest.mark.slow
 def test_the_demo_shows_everything_and_leaves_nothing_running(
@@ -75,6 +108,7 @@ def test_the_demo_shows_everything_and_leaves_nothing_running(
         assert wheel.replace("_", " ").capitalize() in demo.output
     assert re.search(r"^report: .*report\.html$", demo.output, re.MULTILINE)
     assert "FAIL" not in demo.output
+    assert_page_shows(demo.output)
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL])
