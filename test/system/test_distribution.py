@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+import re
 import runpy
 import subprocess
 import sys
@@ -74,3 +76,31 @@ def test_every_requirement_is_pinned_within_its_range(lock, monkeypatch):
         assert any(
             version in wanted.specifier for version in pins.get(canonicalize_name(wanted.name), ())
         ), text
+
+
+def test_the_image_runs_what_the_readme_says():
+    block = (ROOT / "README.md").read_text().split("## With ROS 2")[1].split("```")[1]
+    said = [line.partition("#")[0].strip() for line in block.splitlines()]
+    recipe = (ROOT / "Dockerfile").read_text()
+    for command in said:
+        if command.startswith(("rosdep", "pip", "colcon")):
+            assert command in recipe, command
+    stages = re.findall(r"^FROM (\S+)(?: AS (\w+))?", recipe, re.MULTILINE)
+    assert stages[0][0] == "ros:jazzy"
+    container = json.loads((ROOT / ".devcontainer/devcontainer.json").read_text())
+    assert container["build"]["target"] in dict(stages).values()
+    assert (ROOT / ".devcontainer" / container["build"]["dockerfile"]).is_file()
+
+
+def test_one_version_is_released():
+    changelogs = ("CHANGELOG.rst", "smp_interfaces/CHANGELOG.rst")
+    found = {
+        n: re.findall(r"^(\S+) \(\d{4}-\d\d-\d\d\)\n-+$", (ROOT / n).read_text(), re.M)[0]
+        for n in changelogs
+    }
+    found |= {
+        n: re.findall(r"<version>(.+)</version>", (ROOT / n).read_text())[0]
+        for n in ("package.xml", "smp_interfaces/package.xml")
+    }
+    found["setup.py"] = re.findall(r'version="(.+)"', (ROOT / "setup.py").read_text())[0]
+    assert len(set(found.values())) == 1, found
