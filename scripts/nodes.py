@@ -48,19 +48,19 @@ PARAMETER_SERVICES = ("rcl_interfaces/", "type_description_interfaces/")
 
 HEAD = """# Nodes
 
-Topics, services and parameters of every node, as the node itself says them; printed by
-`python scripts/nodes.py`. Names are relative to the robot's namespace (`-r __ns:=/robot1`), those
-with a slash before them are one for all robots; `wheel_pid` runs in its wheel's
+Topics, services and parameters of every node, as the node itself reports them; printed by
+`python scripts/nodes.py`. Names are relative to the namespace of the robot (`-r __ns:=/robot1`);
+names with a leading slash are global. `wheel_pid` runs in the namespace of its wheel
 (`-r __ns:=/robot1/front_left`). Units are SI. All nodes answer the usual parameter services and
-write to `/rosout`. `skid_steer` hears `cmd_vel` as `geometry_msgs/msg/Twist` too once somebody
-publishes that, and publishes `/tf` where `tf2_msgs` is installed. `record` and `play` have the
-topics that their arguments name (`--help`).
+write to `/rosout`. `skid_steer` subscribes to `cmd_vel` as `geometry_msgs/msg/Twist` too once it is
+published, and publishes `/tf` where `tf2_msgs` is installed. `record` and `play` have the topics
+that their arguments name (`--help`).
 
-All nodes have `use_sim_time`: stamps, ages and the intervals of odometry and control are those of
-`/clock` then, and a `/clock` that is not heard is named on `/diagnostics`. Silence is measured in
-real time, so that a clock that stands still stops no watchdog: a clock so slow that feedback comes
-less often than `feedback_timeout` allows stops the wheels. The motors of `motor_plant` move in
-simulated time, too; the signals of `excite` pass in real time.
+All nodes have `use_sim_time`: stamps, ages and the intervals of odometry and control then follow
+`/clock`, and `/diagnostics` reports a missing `/clock`. Silence is measured in real time, so a
+paused clock stops no watchdog; a clock so slow that feedback comes less often than
+`feedback_timeout` allows stops the wheels. The motors of `motor_plant` follow simulated time, the
+signals of `excite` real time.
 """
 
 

@@ -50,8 +50,8 @@ class PidGains:
     )
     antiwindup_strategy: str = described(
         "none",
-        "What the integral does while the output is clamped: none (it goes on), back_calculation "
-        "(it is driven back) or conditional_integration (it does not wind up further).",
+        "Integral while the output is clamped: none (it continues), back_calculation (it is driven "
+        "back) or conditional_integration (it stops winding up).",
     )
     tracking_time_constant: float = described(
         0.0, "Of back-calculation [s]; 0: sqrt(d/i), or p/i without derivative action.", minimum=0.0

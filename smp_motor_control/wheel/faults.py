@@ -72,7 +72,7 @@ class FaultLimits:
         0.2, "Time of turning against the voltage before that [s]; 0: never."
     )
     tracking_tolerance: float = described(
-        0.5, "Share of the reference by which the speed may be off for long."
+        0.5, "Tolerated lasting error of the speed, as a share of the reference."
     )
     tracking_time: float = described(
         0.45, "Time of being off by more before the motor is switched off [s]; 0: never."

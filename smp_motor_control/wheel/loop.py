@@ -52,7 +52,7 @@ class LoopSettings:
     )  # fmt: skip
     # There is no error while the measurement is what the reference was within so much of the delay.
     reference_doubt: float = described(
-        0.0, "By which that lag may be wrong [s].", minimum=0.0, maximum=1.0
+        0.0, "Uncertainty of that lag [s].", minimum=0.0, maximum=1.0
     )
     # Motor and voltage that changes of set-point keep to, in wheel rad/s; see
     # :class:`~smp_motor_control.reference.profile.Profile`
@@ -65,7 +65,7 @@ class LoopSettings:
     model: MotorModel | None = optional(MotorModel, "dc_gain", "time_constant", prefix="model.")
     noise: ObserverNoise = nested(ObserverNoise(), prefix="observer.")
     implausible_jump: float = described(
-        0.0, "Feedback that jumps for one sample by this, beyond what the motor can change by, is "
+        0.0, "Feedback that jumps for one sample by this, beyond the reach of the motor, is "
         "left out [rad/s, wheel]; 0: half of the top speed, and a count.", minimum=0.0
     )  # fmt: skip
 

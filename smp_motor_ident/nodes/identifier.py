@@ -1,4 +1,4 @@
-"""``identifier``: what the running motors show of themselves, while they run.
+"""``identifier``: estimates the motors while they run.
 
 Keeps a window of every wheel's ``motor_state``, estimates from it in a thread beside the
 callbacks, and publishes ``MotorParameters``.  Before a window has seen enough (time, motion,
@@ -56,12 +56,12 @@ class Settings:
     window: float = fixed(60.0, "How much of the past is used [s].", minimum=2.0, maximum=600.0)
     period: float = fixed(5.0, "Least interval between two estimates of a wheel [s].", minimum=0.5)
     share: float = described(
-        0.03, "Most of a processor that estimates take of it in the long run [1].",
+        0.03, "Largest share of a processor for estimates in the long run [1].",
         minimum=1e-3, maximum=1.0,
     )  # fmt: skip
     model: str = described("auto", "Model to fit; auto chooses the simplest that holds.")
     commissioned: str = fixed("", "identification.json, or its folder, of the motors to watch.")
-    history: str = fixed("", "File that what is seen of them is added to.")
+    history: str = fixed("", "File to which the history of the motors is appended.")
     demands: Demands = nested(Demands(), prefix="demands.")
 
     def __post_init__(self) -> None:
