@@ -12,9 +12,15 @@ docstrings() {
     xargs -0 python scripts/docstrings.py
 }
 docs() { sphinx-build -q -W --keep-going docs docs/_build/html; }
+licence() { scripts/licence.sh; }  # once every file has the header
+# What tools leave behind is not tracked.
+leftovers() {
+  ! git ls-files |
+    grep -E '(^|/)(\.cache|\.rustup|\.cargo|\.npm|node_modules|\.venv|\.[a-z_]+_cache|\.hypothesis|__pycache__|[^/]+\.egg-info|\.DS_Store|\.idea|\.vscode)(/|$)|\.(pyc|nbi|nbc|orig|rej|swp)$'
+}
 
 guards=("$@")
-[ $# -gt 0 ] || guards=(format lint types imports docstrings docs)
+[ $# -gt 0 ] || guards=(format lint types imports docstrings docs leftovers)
 failed=()
 for guard in "${guards[@]}"; do
   if output=$("$guard" 2>&1); then
