@@ -63,6 +63,11 @@ EXTRAS = {
 }
 
 
+def find_files(pattern: str) -> list[str]:
+    """Return the files of a pattern, without the links that colcon leaves of moved files."""
+    return [name for name in glob(pattern, recursive=True) if os.path.isfile(name)]
+
+
 def prefixes() -> list[Path]:
     """Return the install prefixes of the sourced workspaces."""
     named = os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep)
@@ -162,17 +167,15 @@ setup(
         ("share/ament_index/resource_index/packages", [f"resource/{NAME}"]),
         (
             f"share/{NAME}",
-            ["package.xml", "LICENSE", *glob("*.md"), "CHANGELOG.rst"],
+            ["package.xml", "LICENSE", *find_files("*.md"), "CHANGELOG.rst"],
         ),
-        (f"share/{NAME}/launch", glob("launch/*.launch.py")),
-        (f"share/{NAME}/config", glob("config/*")),
+        (f"share/{NAME}/launch", find_files("launch/*.launch.py")),
+        (f"share/{NAME}/config", find_files("config/*")),
         *(
-            (f"share/{NAME}/{folder}", glob(f"{folder}/*.md"))
-            for folder in sorted(
-                {str(Path(page).parent) for page in glob("docs/**/*.md", recursive=True)}
-            )
+            (f"share/{NAME}/{folder}", find_files(f"{folder}/*.md"))
+            for folder in sorted({str(Path(page).parent) for page in find_files("docs/**/*.md")})
         ),
-        (f"share/{NAME}/docs/figures", glob("docs/figures/*")),
+        (f"share/{NAME}/docs/figures", find_files("docs/figures/*")),
     ],
     install_requires=REQUIRES,
     extras_require=EXTRAS,
