@@ -11,8 +11,9 @@ docstrings() {
   find smp_motor_control smp_motor_ident -name '*.py' -not -path '*/nodes/*' -print0 |
     xargs -0 python scripts/docstrings.py
 }
+prose() { python scripts/prose.py; }
 docs() { sphinx-build -q -W --keep-going docs docs/_build/html; }
-licence() { scripts/licence.sh; }  # once every file has the header
+licence() { scripts/licence.sh; }
 # What tools leave behind is not tracked.
 leftovers() {
   ! git ls-files |
@@ -20,7 +21,7 @@ leftovers() {
 }
 
 guards=("$@")
-[ $# -gt 0 ] || guards=(format lint types imports docstrings docs leftovers)
+[ $# -gt 0 ] || guards=(format lint types imports docstrings prose docs licence leftovers)
 failed=()
 for guard in "${guards[@]}"; do
   if output=$("$guard" 2>&1); then

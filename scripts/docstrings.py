@@ -1,8 +1,9 @@
+# SPDX-License-Identifier: Apache-2.0
 """Check the sections of docstrings with numpydoc's validator, as [tool.numpydoc_validation] says.
 
-Sections are for the public API (`PUBLIC` and whatever has one already); elsewhere a line suffices.
-What takes no argument and says in its summary what it returns (a property, or ``"Return the ..."``)
-needs no Returns section that would say it again. Functions within functions are nobody's interface.
+Sections are for the public API (`PUBLIC` and docstrings that have one); elsewhere a line suffices.
+A function without arguments whose summary tells its result (a property, or ``"Return the ..."``)
+needs no Returns section. Nested functions are exempt.
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ def has_sections(node: ast.FunctionDef | ast.ClassDef) -> bool:
 
 
 def says_what_it_returns(node: ast.FunctionDef) -> bool:
-    """Tell whether the summary line stands for a Returns section."""
+    """Tell whether the summary line replaces a Returns section."""
     decorators = {ast.unparse(decorator) for decorator in node.decorator_list}
     if decorators & {"property", "cached_property", "functools.cached_property"}:
         return True

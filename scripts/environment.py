@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Prepare the environment in two stages, each redone only when its inputs change.
 
 1. ``.venv``: the pinned packages; with ROS 2 Jazzy sourced only those that ROS lacks.
@@ -80,7 +81,7 @@ def find_ros() -> str:
     ):
         code = f"import {', '.join(names)}"
         if subprocess.run([PYTHON, "-c", code], capture_output=True, check=False).returncode:
-            raise SetupError(f"{PYTHON} cannot {code} beside the ROS of {prefix}: {advice}")
+            raise SetupError(f"{PYTHON} cannot {code} with the ROS of {prefix}: {advice}")
     return str(prefix)
 
 
@@ -254,7 +255,7 @@ def build(ros: str, lock: IO[str]) -> None:
 
 
 def verify(ros: str, lock: IO[str]) -> None:
-    """Import what was built, in the shell that setup.bash makes."""
+    """Import the built packages in the shell of setup.bash."""
     script = (
         ". install/local_setup.bash && exec .venv/bin/python -c"
         " 'import rclpy, rosbags, control, numba; from smp_interfaces.msg import MotorState'"

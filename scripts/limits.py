@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Print every limit as a page: ``python scripts/limits.py > docs/limits.md``."""
 
 from __future__ import annotations
@@ -5,13 +6,11 @@ from __future__ import annotations
 import sys
 
 from smp_motor_ident.bag import limits as recordings
-from smp_motor_ident.diagnosis import (
-    instrument_limits,
-    response_limits,
-    sample_limits,
-    wheel_limits,
-)
-from smp_motor_ident.diagnosis import limits as estimates
+from smp_motor_ident.commission import wheel_limits
+from smp_motor_ident.infer import instrument_limits, response_limits
+from smp_motor_ident.limits import Limit
+from smp_motor_ident.quality import limits as estimates
+from smp_motor_ident.quality import sample_limits
 from smp_motor_ident.report import limits as fleets
 from smp_motor_ident.tune import limits as gains
 
@@ -38,7 +37,7 @@ def page() -> str:
         lines += ["", f"## {title}", "", "| limit | value | unit | reason | shown by |"]
         lines += ["| --- | --- | --- | --- | --- |"]
         for name, one in vars(table).items():
-            if isinstance(one, estimates.Limit):
+            if isinstance(one, Limit):
                 cells = (f"`{name}`", f"{one.value:g}", one.unit, one.reason, f"`{one.test}`")
                 lines.append("| " + " | ".join(cells) + " |")
     return "\n".join(lines) + "\n"

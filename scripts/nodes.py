@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Print the nodes' topics, services and parameters: ``python scripts/nodes.py > docs/nodes.md``.
 
 Each node is made as its executable makes it, and asked.
@@ -48,19 +49,19 @@ PARAMETER_SERVICES = ("rcl_interfaces/", "type_description_interfaces/")
 
 HEAD = """# Nodes
 
-Topics, services and parameters of every node, as the node itself reports them; printed by
-`python scripts/nodes.py`. Names are relative to the namespace of the robot (`-r __ns:=/robot1`);
-names with a leading slash are global. `wheel_pid` runs in the namespace of its wheel
+Topics, services and parameters of every node, as declared in its code; printed by
+`python scripts/nodes.py`. Names are relative to the robot's namespace (`-r __ns:=/robot1`), those
+with a slash before them are common to all robots; `wheel_pid` runs in its wheel's
 (`-r __ns:=/robot1/front_left`). Units are SI. All nodes answer the usual parameter services and
-write to `/rosout`. `skid_steer` subscribes to `cmd_vel` as `geometry_msgs/msg/Twist` too once it is
+write to `/rosout`. `skid_steer` also reads `cmd_vel` as `geometry_msgs/msg/Twist` once that is
 published, and publishes `/tf` where `tf2_msgs` is installed. `record` and `play` have the topics
-that their arguments name (`--help`).
+named by their arguments (`--help`).
 
 All nodes have `use_sim_time`: stamps, ages and the intervals of odometry and control then follow
-`/clock`, and `/diagnostics` reports a missing `/clock`. Silence is measured in real time, so a
-paused clock stops no watchdog; a clock so slow that feedback comes less often than
-`feedback_timeout` allows stops the wheels. The motors of `motor_plant` follow simulated time, the
-signals of `excite` real time.
+`/clock`, and a missing `/clock` is reported on `/diagnostics`. Time-outs run in real time, so a
+stopped clock stops no watchdog: a clock so slow that feedback exceeds `feedback_timeout` stops the
+wheels. The motors of `motor_plant` also move in simulated time; the signals of `excite` run in
+real time.
 """
 
 
@@ -71,7 +72,7 @@ def type_name(kind: Any) -> str:
 
 
 def quality(profile: QoSProfile) -> str:
-    """Return what a peer must match."""
+    """Return the QoS that a peer must match."""
     best_effort = profile.reliability == ReliabilityPolicy.BEST_EFFORT
     latched = profile.durability == DurabilityPolicy.TRANSIENT_LOCAL
     return ("best effort" if best_effort else "reliable") + (", transient local" if latched else "")
@@ -152,7 +153,7 @@ def section(namespace: str, make: Callable[[], Node]) -> str:
 
 def page() -> str:
     """Return all nodes as a page of Markdown."""
-    teleop_wheels.Terminal = Mock()  # there is none
+    teleop_wheels.Terminal = Mock()  # scripts have no terminal
     return "\n".join([HEAD, *(section(*node) for node in NODES)])
 
 

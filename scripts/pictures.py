@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Draw the pictures of the pages: ``make pictures``, which takes six minutes.
 
 The simulated robot is identified, tuned, driven and commissioned; headless Chromium shows the pages
@@ -58,7 +59,7 @@ def prepare(folder: Path) -> None:
         print("pictures:", *command, flush=True)
         subprocess.run(command, cwd=folder, check=True, stdout=subprocess.DEVNULL)
 
-    os.environ.update({"ROS_DOMAIN_ID": DOMAIN, **loopback.environment(), **os.environ})
+    os.environ.update({"ROS_DOMAIN_ID": DOMAIN, **loopback.loopback_environment(), **os.environ})
     folder.mkdir(parents=True, exist_ok=True)
     if not (folder / "demo").exists():
         run("demo", "--output", "demo")

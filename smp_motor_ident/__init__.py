@@ -1,1 +1,2 @@
-"""Knowing DC motors: from a recording to parameters, their certainty, and gains."""
+# SPDX-License-Identifier: Apache-2.0
+"""Identify DC motors from recordings, with uncertainties, and design gains."""

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """One typed entry point to numba, so that compiled functions keep their signatures for mypy."""
 
 from __future__ import annotations
@@ -20,9 +21,9 @@ OPTIONS: dict[str, Any] = {
 
 
 def _stamp() -> tuple[tuple[int, int], ...]:
-    """Return what changes when a module does whose functions are compiled into each other."""
+    """Return a key that changes with any module whose functions are compiled into each other."""
     here = Path(__file__)
-    folders = (here.parent / name for name in ("likelihood", "model"))
+    folders = (here.parent / name for name in ("simulate", "chain", "fit", "quality"))
     files = [here, *(file for folder in folders for file in sorted(folder.glob("*.py")))]
     return tuple((file.stat().st_mtime_ns, file.stat().st_size) for file in files)
 
@@ -31,7 +32,7 @@ STAMP = _stamp()
 
 
 def _stamped(dispatcher: Any) -> Any:
-    """Make what lies on the disk void when any of the modules changed, not only its own.
+    """Invalidate the cache on disk when any of the modules changes, not only the function's own.
 
     Numba looks at the file of the outermost function alone: an edit of a function that was
     compiled into it would go unnoticed.
@@ -45,7 +46,7 @@ def _stamped(dispatcher: Any) -> Any:
 
 
 def _without_typing(cache: Any) -> Callable[[Any, Any], Any]:
-    """Return how a cache loads what it holds without the rules of typing and lowering.
+    """Return a cache's loader that skips numba's typing and lowering rules.
 
     Numba registers a few thousand of them before it looks at the disk; machine code that is
     there needs none of them but memory, and where it is not there the compiler registers them.
@@ -62,9 +63,9 @@ def _without_typing(cache: Any) -> Callable[[Any, Any], Any]:
 def compiled(function: F) -> F:
     """Compile a function to machine code on its first call and keep it on disk.
 
-    Sums are not regrouped and products not fused with them: a function is also compiled into its
-    callers, and which copy runs hangs on which was loaded first, so that the last digits of the
-    first run would not be those of the next.  A descent on data that no motor fits ends elsewhere.
+    Sums are neither regrouped nor fused with products: a function is also compiled into its
+    callers, and the order of loading decides which copy runs, so the last digits would differ
+    between the first run and the next, and with them the end of a descent on unfitting data.
     """
     return cast(F, _stamped(numba.njit(**OPTIONS)(function)))
 

@@ -1,15 +1,14 @@
+# SPDX-License-Identifier: Apache-2.0
 """Compile for this machine before anybody waits for it: ``python -m smp_motor_ident.compilation``.
 
-What Python and numba compile stays on the disk beside the modules.  The rehearsal is a real one:
-a motor is simulated, estimated from each kind of signal, and given gains, so that every compiled
-function is called with the types that it has in use.  Where all is compiled already it takes a
-second.
+The results of Python's and numba's compilers stay on the disk next to the modules.  A motor is
+simulated, estimated from each kind of signal and given gains, so every compiled function is called
+with the types of real use.  If all is compiled already, this takes a second.
 """
 
 from __future__ import annotations
 
 import compileall
-import contextlib
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
 from pathlib import Path
@@ -18,13 +17,12 @@ import numpy as np
 
 from smp_motor_control.motor.friction import Motor
 from smp_motor_control.motor.parameters import MotorParameters
-from smp_motor_ident.errors import InsufficientExcitationError
 from smp_motor_ident.estimate import estimate
 from smp_motor_ident.record import Hardware, Record
 
 STEP, SAMPLES, COUNTS = 0.01, 400, 500.0
 FEW = 100
-"""Samples from which an estimate takes no longer than loading what it calls."""
+"""Samples whose estimate takes no longer than loading the compiled functions."""
 MOTOR = MotorParameters(
     resistance=3.0, inductance=0.05, motor_constant=0.03, inertia=1.4e-5, viscous_friction=5e-5
 )
@@ -59,14 +57,10 @@ def rehearse(signals: str) -> None:
     """Estimate from some signals, and design gains."""
     from smp_motor_ident.tune import Loop, design  # `load` does without
 
-    whole, smooth = recording(1e-3), recording(0.0)
-    speed = replace(smooth, current=None, count=None)
     if signals == "whole":
-        design(estimate(whole), Loop())
-        return
-    estimate(speed)
-    with contextlib.suppress(InsufficientExcitationError):  # it has no flexible shaft
-        estimate(speed, "flexible_shaft")
+        design(estimate(recording(1e-3)), Loop())
+    else:
+        estimate(replace(recording(0.0), current=None, count=None))
 
 
 def main() -> int:

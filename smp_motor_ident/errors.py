@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Errors of the identification side; exit codes as in the command-line contract."""
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ __all__ = [
 
 
 class BagError(SmpError):
-    """A recording cannot be read, or does not hold what was asked for."""
+    """A recording cannot be read or lacks requested data."""
 
 
 class SignalError(SmpError):
@@ -45,6 +46,6 @@ class UnknownLagError(InsufficientExcitationError):
 
 
 class DesignError(SmpError):
-    """No gains meet what was asked; the message tells the limit and the nearest design."""
+    """No gains meet the targets; the message tells the limit and the nearest design."""
 
     exit_code = 1

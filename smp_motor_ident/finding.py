@@ -1,4 +1,5 @@
-"""What is warned of, refused or advised: a code for programs, a message for people."""
+# SPDX-License-Identifier: Apache-2.0
+"""Findings: warnings, refusals and advice, with a code for programs and a message for people."""
 
 from __future__ import annotations
 
@@ -22,11 +23,13 @@ class Finding:
     severity : {'note', 'warning', 'unreliable', 'refused'}
         ``unreliable``: a stated number may be off by more than its interval.
     message : str
-        What was found, in words, with the values.
+        The observation in words, with values and units.
     evidence : mapping of str to float, str or None
         The numbers behind it, such as a test statistic and its limit.
     advice : str
         What to do about it, such as which recording would settle it.
+    quantities : tuple of str
+        Numbers that it concerns, by the names of `result.UNITS`; empty for all.
     """
 
     code: str
@@ -34,8 +37,9 @@ class Finding:
     message: str
     evidence: Mapping[str, float | str | None] = field(default_factory=dict)
     advice: str = ""
+    quantities: tuple[str, ...] = ()
 
 
 def gravest(findings: Iterable[Finding]) -> Severity | None:
-    """Return the gravest severity among findings, None where there is none."""
+    """Return the gravest severity among findings, None without findings."""
     return max((f.severity for f in findings), key=SEVERITIES.index, default=None)

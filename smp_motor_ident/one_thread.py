@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Linear algebra of a few columns on one thread: others would only wait for their share of it."""
 
 from contextlib import AbstractContextManager, nullcontext

@@ -1,4 +1,5 @@
-"""Record: what everything in this package passes on, one motor's validated signals.
+# SPDX-License-Identifier: Apache-2.0
+"""Record: one motor's validated signals, the common input of this package.
 
 All quantities are at the motor shaft, before the gearbox; time is in seconds from the
 start of the record.  Records know no files, no topics and no ROS.
@@ -19,12 +20,12 @@ from smp_motor_ident.finding import Finding
 
 Positive = Annotated[float, msgspec.Meta(gt=0)]
 NotNegative = Annotated[float, msgspec.Meta(ge=0)]
-"""Numbers of a file that must be so; what programs make is not checked."""
+"""Properties checked when read from a file."""
 
 
 @dataclass(frozen=True)
 class Hardware:
-    """What a description or the user tells about gearbox, encoder and supply.
+    """Gearbox, encoder and supply as described by the recording or the user.
 
     Attributes
     ----------
@@ -84,7 +85,7 @@ class Record:
     source : str
         Name of the bag or file.
     findings : tuple of Finding
-        What was repaired, assumed or lost while reading.
+        Repairs, assumptions and losses while reading.
     velocity_window : float
         Length [s] of the trailing window over which ``velocity`` is known to be averaged;
         0 where it is instantaneous or unknown.

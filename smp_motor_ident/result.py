@@ -1,4 +1,5 @@
-"""What an estimation returns: numbers with their certainty, status and reasons.
+# SPDX-License-Identifier: Apache-2.0
+"""Result of an estimation: values with their uncertainty, status and reasons.
 
 Plain data, written to and read from ``identification.json`` without loss.
 """
@@ -42,7 +43,9 @@ UNITS: Mapping[str, str] = {
     "averaging_window": "s",
     "sensor_lag": "s",
     "current_lag": "s",
+    "encoder_error": "rad",
     "dead_zone": "V",
+    "least_command": "V",
     "clip_voltage": "V",
     "slew_rate": "V/s",
     "source_resistance_ratio": "1",
@@ -59,7 +62,7 @@ UNITS: Mapping[str, str] = {
 
 @dataclass(frozen=True)
 class Share:
-    """A systematic uncertainty of one number: the same in all recordings, and seen in none.
+    """A systematic uncertainty of one number, common to all recordings and invisible in them.
 
     Attributes
     ----------
@@ -86,10 +89,10 @@ class Quantity:
     Attributes
     ----------
     value : float or None
-        None where the data cannot tell it.
+        None where the data do not determine it.
     std : float or None
-        Random standard deviation, by which other recordings of the same motor would scatter; None
-        where value is None or the user fixed it.
+        Random standard deviation, the scatter between recordings of the same motor; None where
+        value is None or the user fixed it.
     ci95 : tuple of float or None
         95 % confidence interval of the random uncertainty; of an unidentifiable combination the
         range that the data leave open.
@@ -141,7 +144,7 @@ class FitPercent:
 
 @dataclass(frozen=True)
 class Candidate:
-    """A candidate structure, as it did on the data."""
+    """A candidate structure and its fit."""
 
     model: str
     fit_percent: float | None
@@ -152,7 +155,7 @@ class Candidate:
 
 @dataclass(frozen=True, eq=False)
 class Correlation:
-    """Correlation over lags [samples], with the band that all of them stay in by chance."""
+    """Correlation over lags [samples], with the simultaneous 95 % band of white residuals."""
 
     lag: Array
     value: Array
@@ -164,7 +167,7 @@ class ModelError:
     """Error of the model's response relative to that response, band by band."""
 
     frequency: tuple[float, ...]  # middles of the bands [rad/s], rising
-    # shown, bound: magnitude as estimated, and what it does not exceed with 95 % [-]
+    # shown, bound: estimated magnitude, and its upper 95 % bound [-]
     shown: tuple[float, ...]
     bound: tuple[float, ...]
 
@@ -173,7 +176,7 @@ class ModelError:
 class ResidualTests:
     """Whiteness of the residuals, independence from the input (95 % bands), error by frequency.
 
-    The correlations are what the verdicts are of; they are for the report and stay out of the JSON.
+    The verdicts are based on the correlations, which are for the report and not in the JSON.
     """
 
     white: bool | None = None
@@ -181,6 +184,14 @@ class ResidualTests:
     autocorrelation: Correlation | None = field(default=None, compare=False, repr=False)
     cross_correlation: Correlation | None = field(default=None, compare=False, repr=False)
     model_error: ModelError | None = None
+
+
+@dataclass(frozen=True)
+class ChainRecord:
+    """The chain that produced the recordings: codes of its components, values of its parameters."""
+
+    components: tuple[str, ...] = ()
+    values: Mapping[str, float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -216,8 +227,8 @@ class Estimate:
     parameters : mapping of str to Quantity
         Physical parameters at the motor shaft, with ``unidentifiable`` ones listed as such.
     combinations : mapping of str to Quantity
-        What voltage and speed alone tell: ``dc_gain``, ``time_constant``,
-        ``time_constant_product``, ``static_voltage``, ``delay`` as far as the model has them;
+        Quantities from voltage and speed alone: ``dc_gain``, ``time_constant``,
+        ``time_constant_product``, ``static_voltage``, ``delay`` if the model has them;
         ``steady_speed`` at one voltage (in the finding ``one_level``) where that alone is known.
     names : tuple of str
         Quantities that ``covariance`` is about, in its order.
@@ -229,14 +240,13 @@ class Estimate:
     speed_step : float
         Step [rad/s] in which that speed comes; 0 where it comes in none, or was an angle.
     angle_noise : float
-        Standard deviation [rad] of the noise on the angle that was recorded, or that a recorded
-        speed is the difference of; 0 where that was counts, whose quantisation is known, or a speed
-        that is none.
-    alternatives : tuple of mapping of str to float
-        Motors of other structures, and with other delays, that the data do not exclude: the
-        combinations of each, without those that it does not have.
+        Standard deviation [rad] of the noise on the recorded angle, or on the angle whose
+        difference is the recorded speed; 0 for counts, whose quantisation is known, and for other
+        speeds.
     systematic : tuple of Systematic
         Errors that no recording shows; ``std``, ``ci95`` and ``covariance`` leave them out.
+    chain : ChainRecord
+        Components between command and recording, with their values.
     """
 
     wheel: str
@@ -258,12 +268,12 @@ class Estimate:
     largest_voltage: float = 0.0
     sources: tuple[str, ...] = ()
     hardware: Hardware = Hardware()
-    alternatives: tuple[Mapping[str, float], ...] = ()
     systematic: tuple[Systematic, ...] = ()
+    chain: ChainRecord = ChainRecord()
 
     @property
     def unidentifiable(self) -> tuple[str, ...]:
-        """Parameters that the data cannot tell."""
+        """Parameters that the data do not determine."""
         return tuple(n for n, q in self.parameters.items() if q.status == "unidentifiable")
 
     @property
@@ -273,7 +283,7 @@ class Estimate:
 
     @property
     def advice(self) -> tuple[str, ...]:
-        """What the findings advise to do."""
+        """Advice of the findings."""
         return tuple(dict.fromkeys(f.advice for f in self.findings if f.advice))
 
     @property
@@ -305,7 +315,7 @@ class Estimate:
         return default if quantity is None or quantity.value is None else quantity.value
 
     def evidence(self, code: str, name: str) -> float:
-        """Return the largest number of that name in the findings of a code, 0 where there is none.
+        """Return the largest number of that name in the findings of a code, 0 without one.
 
         Parameters
         ----------
@@ -341,12 +351,12 @@ class Estimate:
 
 
 _WRITTEN = (
-    "model", "parameters", "identifiable", "unidentifiable", "combinations", "covariance",
-    "systematic", "alternatives", "fit_percent", "candidates", "residuals", "findings",
+    "model", "chain", "parameters", "identifiable", "unidentifiable", "combinations", "covariance",
+    "systematic", "fit_percent", "candidates", "residuals", "findings",
     "warnings", "advice", "samples", "duration", "sample_time", "speed_noise", "speed_step",
     "angle_noise", "largest_voltage", "sources", "hardware",
 )  # fmt: skip
-"""What of an estimate stands in ``identification.json``."""
+"""Fields of an estimate in ``identification.json``."""
 
 
 def plain(value: Any) -> Any:

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Any robot's recordings as records: the only part of the project that reads and writes bags.
 
 `read_records` gives one `smp_motor_ident.record.Record` per wheel, whatever the format; a
@@ -40,7 +41,7 @@ _HOMES = {
 
 
 def __getattr__(name: str) -> Any:
-    """Import what is asked for (PEP 562)."""
+    """Import a name on first use (PEP 562)."""
     for module, exported in _HOMES.items():
         if name in exported:
             return getattr(import_module(f"{__name__}.{module}"), name)

@@ -1,4 +1,5 @@
-"""From columns to one motor's Record: units, clock, order, repairs, segments."""
+# SPDX-License-Identifier: Apache-2.0
+"""Make one motor's Record from columns: units, clock, order, repairs, segments."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -12,8 +13,8 @@ from smp_motor_ident.bag import checks, clock, counter, mapping, units
 from smp_motor_ident.bag.axis import Motor, Series, finite, on_one_axis, unwrapped
 from smp_motor_ident.bag.limits import COUNTED
 from smp_motor_ident.bag.storage import Table
-from smp_motor_ident.diagnosis.stamps import find_beat, moves_on
 from smp_motor_ident.errors import BagError
+from smp_motor_ident.quality.stamps import find_beat, moves_on
 from smp_motor_ident.record import Hardware, Record
 
 _OUTPUTS = ("count", "position", "velocity")
@@ -43,7 +44,7 @@ def assemble(
         )
         motor.tell("clock_set", text, "warning", times=len(leaps), longest=max(leaps))
     if plan.clock == "auto":
-        times |= {topic: _on_beat(motor, topic, times[topic]) for topic in arrivals}
+        times |= {topic: _fit_arrivals(motor, topic, times[topic]) for topic in arrivals}
     given = {name: signal for name, signal in plan.signals.items() if name != "time"}
     series = {n: _series(motor, n, signal, times[signal.topic]) for n, signal in given.items()}
     for name in ("voltage", axis_name):
@@ -51,12 +52,12 @@ def assemble(
             raise BagError(f"{motor.where}: {given[name].field} holds no number; map another field")
     together = plan.signals["voltage"].topic == plan.signals[axis_name].topic
     if together:
-        _drop_lost(motor, series, axis_name)
+        _drop_incomplete_samples(motor, series, axis_name)
     elif axis_name == "count":  # a whole number has no NaN
         series["count"] = finite(series["count"])
     _check(motor, series)
     if together:
-        _drop_lost(motor, series, axis_name)
+        _drop_incomplete_samples(motor, series, axis_name)
     return on_one_axis(motor, series, axis_name)
 
 
@@ -65,20 +66,20 @@ def _span(seconds: float) -> str:
     return f"{days / 365.25:.3g} years" if days > 700 else f"{days:.3g} days"
 
 
-def _on_beat(motor: Motor, topic: str, time: Integers) -> Integers:
-    """Return arrival times on the beat of their sender, or as they are where there is none."""
+def _fit_arrivals(motor: Motor, topic: str, time: Integers) -> Integers:
+    """Return arrival times fitted to the sender's period, unchanged if it has none."""
     table = motor.tables[topic]
     together = np.diff(time) == 0
     if together.any():
         alike = np.all([np.diff(column) == 0 for column in table.columns.values()], axis=0)
-        # What is held is alike whenever it comes; what is there twice only at one time
+        # A held value repeats at any time, a duplicated message only at its own time.
         if np.mean(alike[together]) > 0.5 > np.mean(alike[~together]):
             return time
     beat = find_beat(time)
     if beat is None:
         return time
     if table.clocked and not beat.repeated:
-        # Stamps of one's own may be the samples' instants: the motion tells.
+        # The motion shows whether header stamps are the sampling instants.
         signal = next((s for n, s in motor.plan.signals.items() if n in _MOTION), None)
         if clock.rhythm(time).regular or signal is None or signal.topic != topic:
             return time
@@ -86,7 +87,7 @@ def _on_beat(motor: Motor, topic: str, time: Integers) -> Integers:
         if not moves_on(beat, time, motion):
             return time
     text = (
-        f"{topic or 'time'}: arrival times put back on their beat of {beat.period * 1e-6:.5g} ms "
+        f"{topic or 'time'}: arrival times fitted to their period of {beat.period * 1e-6:.5g} ms "
         f"(median latency {beat.latency * 1e-6:.3g} ms)"
     )
     period, deviation, latency = (1e-9 * x for x in (beat.period, beat.deviation, beat.latency))
@@ -95,7 +96,7 @@ def _on_beat(motor: Motor, topic: str, time: Integers) -> Integers:
 
 
 def _check(motor: Motor, series: dict[str, Series]) -> None:
-    """Leave out values that cannot be, and a current without sign; give a size its direction."""
+    """Drop impossible values and an unsigned current; sign a magnitude by its direction."""
     if "direction" in series:
         way = series.pop("direction")
         if checks.has_sign(series["voltage"].value):
@@ -105,10 +106,10 @@ def _check(motor: Motor, series: dict[str, Series]) -> None:
             series["voltage"] = checks.signed(series["voltage"], way, motor.where)
     for name in sorted(series, key=lambda name: name != "count"):
         value = series[name].value
-        if name == "count":  # which wraps, and that is no jump
+        if name == "count":  # a wrap is not a jump
             if last := counter.is_full(value):
                 raise BagError(
-                    f"{motor.where}: the count stays at {last}, where a counter of its width ends: "
+                    f"{motor.where}: the count stays at {last}, the end of a counter's range: "
                     "it is full; record a wider one, or one that wraps"
                 )
             count = unwrapped(motor, series).count
@@ -116,13 +117,13 @@ def _check(motor: Motor, series: dict[str, Series]) -> None:
             step = np.quantile(np.abs(np.diff(value)), 0.9) if value.size > 1 else 0.0
             if step > COUNTED.value and not motor.plan.own:
                 raise BagError(
-                    f"{motor.where}: the count moves by {step:.2g} from sample to sample, which is "
-                    "no encoder's; map the column of its counts"
+                    f"{motor.where}: the count moves by {step:.2g} between samples, more than an "
+                    "encoder counts; map the column of its counts"
                 )
         bad = checks.impossible(value, steps_allowed=name in ("voltage", "supply", "current"))
         if bad.any():
             worst = float(np.abs(value[bad]).max())
-            text = f"{name}: {int(bad.sum())} values that jump impossibly (up to {worst:.4g})"
+            text = f"{name}: {int(bad.sum())} values with impossible jumps (up to {worst:.4g})"
             motor.tell("impossible_jump", f"{text} were left out", "warning", values=int(bad.sum()))
             if name == "count":  # a whole number has no NaN: the samples go
                 time = series[name].time
@@ -133,7 +134,7 @@ def _check(motor: Motor, series: dict[str, Series]) -> None:
     if "current" in series and checks.is_unsigned(series["voltage"], series["current"]):
         del series["current"]
         text = (
-            "current: it is positive in both directions, so that it is the supply's or has lost "
+            "current: it is positive in both directions, so it is the supply's current or has lost "
             "its sign; it was left out"
         )
         motor.tell("unsigned_current", text, "warning")
@@ -162,9 +163,9 @@ def _clock(motor: Motor) -> dict[str, Integers]:
     if not poor and max(offsets) - min(offsets) < clock.SAME_CLOCK:
         text = "time: header stamps (the instants of sampling, free of transport delay)"
         motor.tell("time_base", text)
-        _tell_offset(motor, next(iter(tables)), fits)
+        _report_offset(motor, next(iter(tables)), fits)
         if any(len(clock.epochs(stamp)) > 1 for stamp in stamps.values() if stamp is not None):
-            return _set_back(motor, tables, stamps)
+            return _times_across_resets(motor, tables, stamps)
         return {topic: stamp for topic, stamp in stamps.items() if stamp is not None}
     if not fits:
         motor.tell("time_base", f"time: log times ({next(iter(poor.values()))})")
@@ -181,11 +182,11 @@ def _to_log(
     """Return a topic's stamps on the recorder's clock; its log times where it has none."""
     if topic not in fits or stamp is None:
         return motor.tables[topic].logged
-    _tell_offset(motor, topic, fits, always=True)
+    _report_offset(motor, topic, fits, always=True)
     return fits[topic].to_log(stamp)
 
 
-def _set_back(
+def _times_across_resets(
     motor: Motor, tables: Mapping[str, Table], stamps: Mapping[str, Integers | None]
 ) -> dict[str, Integers]:
     """Return times for a recording during which the clock of the stamps was set back."""
@@ -218,7 +219,7 @@ def _stamp(motor: Motor, table: Table) -> Integers | None:
     return np.where(time == clock.NEVER, 0, time)
 
 
-def _tell_offset(
+def _report_offset(
     motor: Motor, topic: str, fits: Mapping[str, clock.ClockFit], always: bool = False
 ) -> None:
     fit = fits[topic]
@@ -231,7 +232,7 @@ def _tell_offset(
 
 
 def _series(motor: Motor, name: str, signal: mapping.Signal, time: Integers) -> Series:
-    """Return one signal in SI at the motor shaft, in order, without what is no sample."""
+    """Return one signal's valid samples in SI at the motor shaft, in order."""
     table = motor.tables[signal.topic]
     column = table.columns.get(signal.field)
     there = table.present.get(signal.field)
@@ -244,11 +245,11 @@ def _series(motor: Motor, name: str, signal: mapping.Signal, time: Integers) -> 
     bits = None
     if name == "count" and column.dtype.kind in "iu" and column.dtype.itemsize < 4:
         bits = 8 * column.dtype.itemsize
-    return Series(time[keep], _converted(motor, name, signal, values), number, bits)
+    return Series(time[keep], _convert(motor, name, signal, values), number, bits)
 
 
 def _order(motor: Motor, time: Integers, table: Table, topic: str) -> Integers:
-    """Return the samples' order of time without duplicates; tell what was repaired."""
+    """Return the indices that sort the samples by time without duplicates; report repairs."""
     steps = np.diff(time)
     if np.all(steps > 0):
         return np.arange(time.size)
@@ -268,14 +269,14 @@ def _order(motor: Motor, time: Integers, table: Table, topic: str) -> Integers:
             for name, column in table.columns.items()
             if not np.array_equal(column[again], column[before], equal_nan=column.dtype.kind == "f")
         ]
-        text = f"{where}: {doubles} samples have the time of another and were left out"
+        text = f"{where}: {doubles} samples with a repeated time were left out"
         text += f" although they differ in {', '.join(differ)}" if differ else " (duplicates)"
         motor.tell("duplicate_samples", text, "warning" if differ else "note", samples=doubles)
     chosen: Integers = order[first]
     return chosen
 
 
-def _converted(motor: Motor, name: str, signal: mapping.Signal, raw: NDArray[Any]) -> NDArray[Any]:
+def _convert(motor: Motor, name: str, signal: mapping.Signal, raw: NDArray[Any]) -> NDArray[Any]:
     """Return values in SI at the motor shaft; counts as int64."""
     if name == "count":
         exact = signal.scale == 1 and signal.offset == 0
@@ -287,7 +288,7 @@ def _converted(motor: Motor, name: str, signal: mapping.Signal, raw: NDArray[Any
     values *= signal.scale
     values += signal.offset
     hardware, plan = motor.hardware, motor.plan
-    measured = "supply" in plan.signals and name == "voltage"  # which comes in below
+    measured = "supply" in plan.signals and name == "voltage"  # multiplied in below
     known = {
         "counts_per_revolution": hardware.counts_per_revolution,
         "supply_voltage": 1.0 if measured else hardware.supply_voltage,
@@ -301,7 +302,7 @@ def _converted(motor: Motor, name: str, signal: mapping.Signal, raw: NDArray[Any
         raise BagError(f"{motor.where}: {error}{seen if unit == 'pwm' else ''}") from None
     supply = known["supply_voltage"]
     if units.needs(name, unit, "supply_voltage") and supply is not None:
-        values = _within(motor, values, supply)
+        values = _clamp_to_supply(motor, values, supply)
     shaft = signal.shaft or motor.plan.shaft
     if unit.startswith("ticks"):
         shaft = signal.shaft or "motor"
@@ -310,29 +311,29 @@ def _converted(motor: Motor, name: str, signal: mapping.Signal, raw: NDArray[Any
         if width:
             turns = width / (2 * np.pi)
             at = "one turn" if abs(turns - 1) < 1e-9 else f"{turns:.6g} turns"
-            motor.tell("angle_wraps", f"position: it wraps at {at}; wrap undone")
+            motor.tell("angle_wraps", f"position: wraps at {at}; it was unwrapped")
     if name in ("velocity", "position") and shaft == "wheel":
         values = Gearbox(motor.hardware.gear_ratio).to_motor(values)
     return values
 
 
-def _within(motor: Motor, volts: Array, supply: float) -> Array:
-    """Return what a driver puts out of a command: no more than its supply, 100 %."""
-    beyond = int(np.sum(np.abs(volts) > supply * (1 + 1e-6)))  # but for what 32 bits round
+def _clamp_to_supply(motor: Motor, volts: Array, supply: float) -> Array:
+    """Return the commanded voltage clamped to the supply."""
+    beyond = int(np.sum(np.abs(volts) > supply * (1 + 1e-6)))  # allow for float32 rounding
     if beyond:
         motor.tell(
             "beyond_full_scale",
             f"{beyond} samples of the command are beyond 100 % (up to "
-            f"{np.nanmax(np.abs(volts)) / supply:.0%}) and taken as that; give the pwm_full_scale "
-            "that is 100 %, and write a value that is a code, such as one to brake, as 0",
+            f"{np.nanmax(np.abs(volts)) / supply:.0%}) and were clamped to it; give the "
+            "pwm_full_scale that is 100 %, and write codes such as a brake command as 0",
             "warning",
             samples=beyond,
         )
     return np.clip(volts, -supply, supply)
 
 
-def _drop_lost(motor: Motor, series: dict[str, Series], axis_name: str) -> None:
-    """Leave out the samples of a common topic whose voltage or output is no number."""
+def _drop_incomplete_samples(motor: Motor, series: dict[str, Series], axis_name: str) -> None:
+    """Leave out the samples of a common topic whose voltage or output is not finite."""
     axis, voltage = series[axis_name], series["voltage"]
     if not np.array_equal(axis.time, voltage.time):
         return

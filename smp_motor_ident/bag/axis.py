@@ -1,4 +1,5 @@
-"""All signals of a motor on the time axis of its main output, cut where nothing is known."""
+# SPDX-License-Identifier: Apache-2.0
+"""Resample all signals of a motor to its main output's times; split at gaps."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -19,14 +20,14 @@ from smp_motor_ident.errors import BagError
 from smp_motor_ident.finding import Finding, Severity
 from smp_motor_ident.record import Hardware, Record
 
-LEAST_ROWS = 2  # one is that of a voltage that held up to its row
-MOST_ROWS = 20_000  # that are looked at for that
-BRIDGED = 2  # samples that may be lost in a row before a new segment begins
+MIN_SHIFT_ROWS = 2  # smallest shift to correct; one row is a voltage that acts before its row
+MAX_TESTED_ROWS = 20_000  # rows examined for such a shift
+MAX_BRIDGED_SAMPLES = 2  # samples that may be lost in a row before a new segment begins
 
 
 @dataclass(eq=False)
 class Motor:
-    """What is known of one motor while its record is made."""
+    """Mapping, hardware and findings of one motor while its record is made."""
 
     wheel: str
     plan: MotorMap
@@ -37,11 +38,11 @@ class Motor:
 
     @property
     def where(self) -> str:
-        """What to call it in messages."""
+        """Recording and wheel, for messages."""
         return f"{self.source}: {self.wheel}"
 
     def tell(self, code: str, text: str, severity: Severity = "note", **evidence: float) -> None:
-        """Note what was found, once."""
+        """Add a finding unless it is there already."""
         finding = found(code, text, severity, **evidence)
         if finding not in self.findings:
             self.findings.append(finding)
@@ -67,27 +68,27 @@ class Series:
 
 
 def on_one_axis(motor: Motor, series: dict[str, Series], axis_name: str) -> Record:
-    """Make a record of signals that were sampled each at its own instants."""
+    """Make a record of signals with different sampling instants."""
     if "supply" in series:
-        _times_supply(series)
+        _multiply_duty_by_supply(series)
     voltage = finite(series["voltage"])
     axis = series[axis_name].time
     alike = np.array_equal(voltage.time, axis)
-    keep = np.ones(axis.size, bool) if alike else _covered(motor, voltage, axis)
+    keep = np.ones(axis.size, bool) if alike else _find_covered_samples(motor, voltage, axis)
     if keep.sum() < 2:
         raise BagError(f"{motor.where}: fewer than 2 samples have a voltage and an output")
     starts = _count_starts(motor, series, keep, axis_name)
     held = motor.plan.held or (
-        _held(motor, voltage, series[axis_name], axis_name, starts) if alike else "after"
+        _detect_hold(motor, voltage, series[axis_name], axis_name, starts) if alike else "after"
     )
     axis = axis[keep]
-    # Of each interval that ends at an instant of the axis
+    # Mean voltage over the interval that ends at each sample
     values = voltage.value.copy() if alike else mean_held(voltage.time, voltage.value, held, axis)
     if alike and held == "after":
         values[1:] = voltage.value[:-1]
-    starts |= _gaps(motor, axis, alike, held, voltage, values)
+    starts |= _find_gaps(motor, axis, alike, held, voltage, values)
     columns: dict[str, Any] = {
-        name: _on_axis(motor, name, series[name], axis, keep)
+        name: _interpolate(motor, name, series[name], axis, keep)
         for name in ("current", "velocity", "position", "count")
         if name in series
     }
@@ -95,8 +96,8 @@ def on_one_axis(motor: Motor, series: dict[str, Series], axis_name: str) -> Reco
         raise BagError(f"{motor.where}: no output has a finite value")
     columns["voltage"] = values
     if not motor.plan.own:
-        axis, columns, starts = _in_time(motor, axis, columns, starts)
-    axis, columns, starts = _without_stubs(motor, axis, columns, starts)
+        axis, columns, starts = _undo_delay(motor, axis, columns, starts)
+    axis, columns, starts = _drop_single_samples(motor, axis, columns, starts)
     if axis.size < 2:
         raise BagError(f"{motor.where}: fewer than 2 samples in a row are left")
     return Record(
@@ -112,20 +113,20 @@ def on_one_axis(motor: Motor, series: dict[str, Series], axis_name: str) -> Reco
     )
 
 
-def _in_time(
+def _undo_delay(
     motor: Motor, axis: Integers, columns: dict[str, Any], starts: Flags
 ) -> tuple[Integers, dict[str, Any], Flags]:
-    """Move a voltage back that is recorded rows after it acts."""
+    """Shift a voltage that is recorded several rows late."""
     edges = np.append(np.flatnonzero(starts), axis.size)
     longest = int(np.argmax(np.diff(edges)))
-    part = slice(edges[longest], min(edges[longest + 1], edges[longest] + MOST_ROWS))
+    part = slice(edges[longest], min(edges[longest + 1], edges[longest] + MAX_TESTED_ROWS))
     name, motion = next((n, v[part]) for n in MOTIONS if (v := columns.get(n)) is not None)
     if not rhythm(axis[part]).regular or not np.isfinite(motion).all():
         return axis, columns, starts
     if name != "velocity":
         motion = np.diff(motion, prepend=motion[:1])
     rows = rows_behind(columns["voltage"][part], motion.astype(np.float64))
-    if rows < LEAST_ROWS:
+    if rows < MIN_SHIFT_ROWS:
         return axis, columns, starts
     late = rows * rhythm(axis[part]).interval * 1e-9
     text = (
@@ -142,8 +143,8 @@ def _in_time(
     return axis[keep], kept, np.concatenate([[True], np.diff(begun) > 0])
 
 
-def _held(motor: Motor, voltage: Series, output: Series, name: str, starts: Flags) -> str:
-    """Return whether a voltage holds from its row on, or held up to it, as the motion tells."""
+def _detect_hold(motor: Motor, voltage: Series, output: Series, name: str, starts: Flags) -> str:
+    """Return whether the motion shows that a voltage acts after its row or before it."""
     motion = output.value.astype(np.float64)
     if name != "velocity":
         motion = np.diff(motion, prepend=motion[:1])
@@ -151,19 +152,19 @@ def _held(motor: Motor, voltage: Series, output: Series, name: str, starts: Flag
     motion[starts | (np.diff(output.time, prepend=output.time[:1]) > gap)] = np.nan
     if not answers_in_its_row(voltage.value, motion):
         return "after"
-    text = f"the {name} answers in the rows in which the voltage changes: it held up to its row"
+    text = f"the {name} responds in the row of a change of voltage: the voltage acts before its row"
     motor.tell("held_before", f"{text} (held=before; map held=after if it did not)")
     return "before"
 
 
 def finite(series: Series) -> Series:
-    """Return the samples that are numbers."""
+    """Return the finite samples."""
     sound = np.isfinite(series.value)
     return series if sound.all() else series.take(sound)
 
 
-def _times_supply(series: dict[str, Series]) -> None:
-    """Multiply the duty cycle by the supply as it was measured."""
+def _multiply_duty_by_supply(series: dict[str, Series]) -> None:
+    """Multiply the duty cycle by the measured supply voltage."""
     supply, voltage = finite(series.pop("supply")), series["voltage"]
     if not supply.time.size:
         raise BagError("the supply signal has no finite value")
@@ -171,7 +172,7 @@ def _times_supply(series: dict[str, Series]) -> None:
     series["voltage"] = Series(voltage.time, voltage.value * measured)
 
 
-def _covered(motor: Motor, voltage: Series, axis: Integers) -> Flags:
+def _find_covered_samples(motor: Motor, voltage: Series, axis: Integers) -> Flags:
     """Return which output samples lie where the input is known."""
     keep: Flags = axis >= voltage.time[0] if voltage.time.size else np.zeros(axis.size, bool)
     if not keep.all():
@@ -198,7 +199,7 @@ def _count_starts(motor: Motor, series: dict[str, Series], keep: Flags, axis_nam
         counter = unwrapped(motor, series)
         motor.findings += counter.findings
         count = counter.count
-        if np.abs(count.astype(np.float64)).max() >= 2.0**53:  # which has no room in a float
+        if np.abs(count.astype(np.float64)).max() >= 2.0**53:  # beyond exact floats
             count = count - count[0]
         series["count"] = Series(series["count"].time, count)
         flags[counter.resets] = True
@@ -219,11 +220,11 @@ def unwrapped(motor: Motor, series: dict[str, Series]) -> Unwrapped:
     raw = counted.value
     if raw.dtype.kind == "f":
         raw = np.rint(raw).astype(np.int64)
-    return unwrap(raw, bits, _expected(series, motor.hardware))
+    return unwrap(raw, bits, _expect_counts(series, motor.hardware))
 
 
-def _expected(series: dict[str, Series], hardware: Hardware) -> Array | None:
-    """Return the counts between samples by the measured speed, where both come together."""
+def _expect_counts(series: dict[str, Series], hardware: Hardware) -> Array | None:
+    """Return the counts between samples expected from a measured speed of the same rows."""
     speed = series.get("velocity")
     if speed is None or hardware.counts_per_revolution is None:
         return None
@@ -236,25 +237,25 @@ def _expected(series: dict[str, Series], hardware: Hardware) -> Array | None:
     return np.where(np.abs(expected) < 2.0**52, expected, 0.0)
 
 
-def _gaps(
+def _find_gaps(
     motor: Motor, axis: Integers, alike: bool, held: str, voltage: Series, values: Array
 ) -> Flags:
     """Return where segments begin because samples are missing; bridge the voltage over a few."""
     beat = rhythm(axis)
     steps, missing = np.diff(axis), beat.missing(axis)
     edges = [0, *(np.flatnonzero(steps > beat.gap()) + 1).tolist(), axis.size]
-    for a, b in pairwise(edges):  # runs below one another may each have a rate of their own
+    for a, b in pairwise(edges):  # each run may have its own rate
         if (own := rhythm(axis[a:b])).regular and b - a > BEATS:
             missing[a : b - 1] = own.missing(axis[a:b])
-    if alike and voltage.number is not None:  # the publisher counted: nothing to be guessed
+    if alike and voltage.number is not None:  # the publisher's numbers tell losses
         missing = np.maximum(np.diff(voltage.number) - 1, 0)
     given = motor.plan.gap
     limit = given * 1e9 if given else beat.gap(averaged=alike and held == "before")
     cut = steps > limit
     if alike and not given:
-        cut |= missing > BRIDGED
+        cut |= missing > MAX_BRIDGED_SAMPLES
     bridged = (missing > 0) & ~cut
-    if alike and bridged.any():  # with the mean of a linearly changing voltage
+    if alike and bridged.any():  # by linear interpolation of the voltage
         k = np.flatnonzero(bridged)
         lost = missing[k]
         weight = (lost + 2 if held == "before" else lost) / (2 * (lost + 1))
@@ -277,7 +278,7 @@ def _gaps(
     return np.concatenate([[True], cut])
 
 
-def _on_axis(
+def _interpolate(
     motor: Motor, name: str, series: Series, axis: Integers, keep: Flags
 ) -> NDArray[Any] | None:
     """Return a signal at the axis's instants, NaN where it is not known."""
@@ -304,10 +305,10 @@ def _on_axis(
     return values
 
 
-def _without_stubs(
+def _drop_single_samples(
     motor: Motor, axis: Integers, columns: dict[str, Any], starts: Flags
 ) -> tuple[Integers, dict[str, Any], Flags]:
-    """Leave out segments of a single sample: they tell nothing."""
+    """Leave out segments of a single sample."""
     edges = np.append(np.flatnonzero(starts), axis.size)
     short = np.diff(edges) < 2
     if not short.any():

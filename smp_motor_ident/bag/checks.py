@@ -1,4 +1,5 @@
-"""What signals cannot be: values that jump impossibly, currents without sign."""
+# SPDX-License-Identifier: Apache-2.0
+"""Detect impossible jumps and currents without a sign."""
 
 import numpy as np
 from scipy.ndimage import median_filter
@@ -8,27 +9,27 @@ from smp_motor_ident.bag.axis import Series
 from smp_motor_ident.bag.limits import JUMP_SPAN, JUMP_STEP, STRAY_ROWS, UNSIGNED_CURRENT
 from smp_motor_ident.errors import BagError
 
-_LEAST = 50
-_SAMPLED = 5000  # values that quantiles and means are taken of
+_MIN_SAMPLES = 50
+_MAX_QUANTILE_SAMPLES = 5000  # values used for quantiles and means
 
 
 def impossible(value: Array, *, steps_allowed: bool) -> Flags:
     """Return which values jump away and back by more than the signal's own range allows.
 
-    A value is impossible that lies many spans of the signal away from its neighbours; where steps
-    are not allowed (whatever has inertia), also one that jumps to and fro by many usual steps.
+    A value is impossible if it lies many spans of the signal away from its neighbours, or, for a
+    signal with inertia, if it jumps to and fro by many usual steps.
     """
     none = np.zeros(value.size, bool)
     sound = np.flatnonzero(np.isfinite(value))
-    if sound.size < _LEAST:
+    if sound.size < _MIN_SAMPLES:
         return none
     x = value[sound]
     with np.errstate(over="ignore", invalid="ignore"):
-        some = x[:: max(x.size // _SAMPLED, 1)]
+        some = x[:: max(x.size // _MAX_QUANTILE_SAMPLES, 1)]
         low, high = np.quantile(some, [0.01, 0.99])
         span = max(high - low, 1e-3 * max(abs(low), abs(high)))
         step = np.abs(np.diff(x))
-        usual = float(np.quantile(step[:: max(x.size // _SAMPLED, 1)], 0.99))
+        usual = float(np.quantile(step[:: max(x.size // _MAX_QUANTILE_SAMPLES, 1)], 0.99))
         if np.ptp(x) <= JUMP_SPAN.value * span and step.max() <= JUMP_STEP.value * usual:
             return none
         away = np.abs(x - median_filter(x, 5, mode="nearest"))
@@ -45,13 +46,13 @@ def impossible(value: Array, *, steps_allowed: bool) -> Flags:
 def is_unsigned(voltage: Series, current: Series) -> bool:
     """Return whether a current is positive in both directions: of the supply, or without sign.
 
-    The armature's current has the sign of what drives it: its means where the voltage is positive
-    and where it is negative cancel, but for an offset.
+    The armature's current follows the sign of the voltage: its means at positive and at negative
+    voltage cancel except for an offset.
     """
     sound = np.isfinite(current.value)
-    every = max(current.time.size // _SAMPLED, 1)
+    every = max(current.time.size // _MAX_QUANTILE_SAMPLES, 1)
     time, amperes = current.time[sound][::every], current.value[sound][::every]
-    if time.size < _LEAST or voltage.time.size < 2:
+    if time.size < _MIN_SAMPLES or voltage.time.size < 2:
         return False
     index = np.clip(np.searchsorted(voltage.time, time, "right") - 1, 0, voltage.time.size - 1)
     volts = voltage.value[index]
@@ -64,11 +65,11 @@ def is_unsigned(voltage: Series, current: Series) -> bool:
     if abs(ahead + back) < UNSIGNED_CURRENT.value * abs(ahead - back):
         return False
     low, high = np.quantile(amperes, [0.05, 0.95])
-    return bool(low > -0.2 * high)  # but for little that is given back to the supply
+    return bool(low > -0.2 * high)  # some current may return to the supply
 
 
 def has_sign(value: Array) -> bool:
-    """Return whether a signal goes both ways by itself, but for stray values."""
+    """Return whether a signal has both signs, ignoring outliers."""
     least = STRAY_ROWS.value * np.count_nonzero(value)
     return bool(min(np.sum(value > 0), np.sum(value < 0)) > least)
 

@@ -1,4 +1,5 @@
-"""Time done right: which clock, in what order, where gaps are, and inputs held over intervals."""
+# SPDX-License-Identifier: Apache-2.0
+"""Clocks, order and gaps of samples, and means of held inputs over intervals."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -19,32 +20,32 @@ Parts = list[tuple[int, int]]
 """Begin and end of runs of rows."""
 
 NEVER = -(2**62)
-"""Where a row has no time."""
+"""Time of a row without one."""
 
 _ROWS = round(SET_BACK.value)
 _BEFORE = 1000
-"""Rows before that are looked at in any case; all since the last fall, so that many cost little."""
+"""Smallest number of earlier rows examined."""
 
 _SECOND = 1_000_000_000
 BEATS = 32
-"""Samples by which a beat is judged."""
+"""Samples that determine a beat."""
 SAME_CLOCK = 50_000_000
-"""Clocks of two topics whose offsets differ by less [ns] are one clock: latency explains it."""
+"""Topics whose offsets differ by less [ns] share a clock; latency explains the difference."""
 
 SET = 1_000_000_000_000_000_000
-"""A time [ns] from 2001 on is of a clock that was set; a smaller one counts from some start."""
+"""Smallest time [ns] of a clock that was set, in 2001; smaller ones count from some start."""
 
 
 def recorded_at(logs: Iterable[Integers]) -> float | None:
-    """Return the first time of a clock that was set [s since 1970], None where there is none."""
+    """Return the first log time of a clock that was set [s since 1970], or None."""
     first = [int(log[log >= SET].min()) for log in logs if (log >= SET).any()]
     return 1e-9 * min(first) if first else None
 
 
 def nanoseconds(column: NDArray[Any], signal: Signal, unit: str) -> Integers:
-    """Return a column of times [ns], `NEVER` where there is none; seconds where no unit is given.
+    """Return a column of times [ns], `NEVER` for missing cells; the default unit is seconds.
 
-    Whole nanoseconds since 1970 have no room in a float: what is whole stays so.
+    Integers stay integers, since a float cannot hold nanoseconds since 1970 exactly.
     """
     second = UNITS["time"][unit or "s"].factor * 1e9
     factor, offset = second * signal.scale, second * signal.offset
@@ -88,7 +89,7 @@ def fit_clock(stamp: Integers, log: Integers) -> ClockFit:
     part = np.minimum((since * (20 / span)).astype(np.int8), 19)
     parts = [inside for k in range(20) if (inside := np.flatnonzero(part == k)).size]
     drift = offset = 0.0
-    for _ in range(3):  # the fastest message of a part is judged without the drift inside it
+    for _ in range(3):  # neglect the drift within a part
         rest = late - drift * since
         best = np.array([inside[np.argmin(rest[inside])] for inside in parts])
         drift, offset = np.polyfit(since[best], late[best], 1).tolist()
@@ -96,7 +97,7 @@ def fit_clock(stamp: Integers, log: Integers) -> ClockFit:
 
 
 def judge_stamps(stamp: Integers | None, log: Integers) -> str:
-    """Return why header stamps cannot be the samples' time; empty where they can."""
+    """Return the reason against header stamps as the samples' times, empty if usable."""
     if stamp is None:
         return "the messages carry no stamp"
     if stamp.size < 2:
@@ -132,16 +133,15 @@ def epochs(time: Integers) -> Parts:
 
 @dataclass(frozen=True)
 class Rhythm:
-    """How regularly samples come."""
+    """Regularity of a sampling interval."""
 
     interval: float  # median interval [ns]
     regular: bool  # whether four of five intervals are within a quarter of it
 
     def missing(self, time: Integers) -> Integers:
-        """Return how many samples are missing before each but the first.
+        """Return the number of missing samples before each but the first.
 
-        A late sample after which the others catch up is late, not preceded by a loss: the
-        beat must stay behind by whole intervals.
+        A loss delays all later samples by whole intervals; a single late sample does not.
         """
         steps = np.diff(time)
         number: Integers = np.zeros(steps.size, np.int64)
@@ -158,10 +158,10 @@ class Rhythm:
         return number
 
     def gap(self, averaged: bool = False) -> float:
-        """Return the interval [ns] beyond which two samples have nothing in common.
+        """Return the interval [ns] that separates two segments.
 
-        A log that is written on change is irregular and holds its voltage for long; but an
-        ``averaged`` voltage does not tell when within a long interval it changed.
+        A log written on change is irregular and holds its voltage for long; an ``averaged``
+        voltage leaves open when it changed within a long interval.
         """
         if self.regular or averaged:
             return max(20 * self.interval, 0.02 * _SECOND)
@@ -169,7 +169,7 @@ class Rhythm:
 
 
 def rhythm(time: Integers) -> Rhythm:
-    """Return how regularly the samples come."""
+    """Return the regularity of sampling."""
     if time.size < 2:
         return Rhythm(0.0, False)
     steps = np.diff(time)
@@ -184,17 +184,17 @@ def mean_held(time: Integers, value: Array, held: str, at: Integers) -> Array:
     wanted = (at - origin) * 1e-9
     level = value[:-1] if held == "after" else value[1:]
     integral = np.concatenate([[0.0], np.cumsum(level * np.diff(seconds))])
-    # Beyond its last instant the input stays as it was last.
+    # After its last instant the input keeps its value.
     whole = np.interp(wanted, seconds, integral) + np.maximum(wanted - seconds[-1], 0) * value[-1]
     mean = np.empty(at.size)
     mean[1:] = np.diff(whole) / np.diff(wanted)
     after = held == "after"
     side = int(np.searchsorted(time, at[0], "right" if after else "left")) - after
     mean[0] = value[min(max(side, 0), value.size - 1)]
-    # Between these no input instant divides the interval between outputs.
+    # Intervals between outputs without an input instant inside
     first, last = np.searchsorted(time, at[:-1], "right"), np.searchsorted(time, at[1:], "left")
     inside = first >= last
-    # An interval without a change has exactly the level that holds there.
+    # An interval without a change has exactly its level.
     index = first - 1 if after else np.minimum(last, value.size - 1)
     mean[1:][inside] = value[np.clip(index, 0, value.size - 1)][inside]
     return mean
@@ -203,9 +203,9 @@ def mean_held(time: Integers, value: Array, held: str, at: Integers) -> Array:
 def runs(time: NDArray[Any], columns: Mapping[str, NDArray[Any]]) -> Parts:
     """Split a table's rows, in the order in which they were written, where its clock starts again.
 
-    It does where the time goes back by more than jitter, the rows go on from there, and they cover
-    again what the rows before have covered.  Single rows out of order, a block that was
-    flushed late and rows that are there twice are no new run; they are sorted.
+    A run begins where the time goes back by more than jitter, continues from there and overlaps
+    the rows before.  Single rows out of order, a block that was flushed late and duplicates
+    start no run; they are sorted.
     """
     parts = _parts(time, columns)
     if len(parts) > 1 and columns:
@@ -234,16 +234,16 @@ def _parts(time: NDArray[Any], columns: Mapping[str, NDArray[Any]]) -> Parts:
     edges, fell = [0], 0
     for k, end in pairwise([*falls, time.size]):
         begin = max(edges[-1], min(fell, k - _BEFORE))
-        if _covers_again(time, columns, slice(begin, k), slice(k, end)):
+        if _overlaps(time, columns, slice(begin, k), slice(k, end)):
             edges.append(k)
         fell = k
     return list(pairwise([*edges, time.size]))
 
 
-def _covers_again(
+def _overlaps(
     time: NDArray[Any], columns: Mapping[str, NDArray[Any]], old: slice, new: slice
 ) -> bool:
-    """Return whether rows lie among earlier ones, as sampled anew and not as written late."""
+    """Return whether rows overlap earlier ones as a new run, rather than a late block."""
     earlier, later = np.sort(time[old]), time[new]
     inside = later[(later >= earlier[0]) & (later <= earlier[-1])]
     holes = np.unique(np.searchsorted(earlier, inside, "right"))
@@ -262,9 +262,9 @@ def _covers_again(
 def one_after_another(
     times: Sequence[Integers], parts: Sequence[Parts], pauses: Sequence[int]
 ) -> list[Integers]:
-    """Return times [ns] on one clock that runs on, with a pause before each part but the first.
+    """Return times [ns] on one continuous clock, with a pause between parts.
 
-    Those of several tables keep what they are apart within each part.
+    Offsets between tables are kept within each part.
     """
     moved = [time.copy() for time in times]
     for k, pause in enumerate(pauses, 1):
@@ -278,9 +278,9 @@ def one_after_another(
 def without_leaps(
     times: Mapping[str, Integers], gap: float
 ) -> tuple[dict[str, Integers], list[float]]:
-    """Return times [ns] of one clock without what it was set forward by, and that [s].
+    """Return times [ns] with forward leaps of the clock removed, and the leaps [s].
 
-    Where no topic has a sample for so long, it is a pause that surely begins a new segment.
+    A leap is an interval in which no topic has a sample; a pause that begins a segment replaces it.
     """
     every = np.sort(np.concatenate(list(times.values())))
     steps = np.diff(every.view(np.uint64))  # the farthest two have no signed distance
@@ -297,14 +297,14 @@ def without_leaps(
 
 
 def pause_between(time: Integers, parts: Parts, gap: float) -> int:
-    """Return a time [ns] that surely begins a new segment; ``gap`` [s] is what the user asked."""
+    """Return a pause [ns] that begins a new segment; ``gap`` [s] is the user's limit."""
     longest = max(parts, key=lambda part: part[1] - part[0])
     usual = rhythm(np.sort(time[slice(*longest)])).gap()
     return 3 * round(max(usual, gap * _SECOND)) + _SECOND
 
 
 def laid_out(tables: Mapping[str, Table], gap: float, where: str) -> dict[str, Table]:
-    """Return tables of one clock with their runs one after another; BagError where they differ."""
+    """Return tables of one clock with their runs in sequence; BagError if the runs differ."""
     every = {topic: runs(table.logged, table.columns) for topic, table in tables.items()}
     numbers = {topic: len(parts) - 1 for topic, parts in every.items()}
     if not any(numbers.values()):
@@ -312,7 +312,7 @@ def laid_out(tables: Mapping[str, Table], gap: float, where: str) -> dict[str, T
     if len(set(numbers.values())) > 1:
         times_in = ", ".join(f"{number} times in {topic}" for topic, number in numbers.items())
         raise BagError(
-            f"{where}: the time goes back {times_in}, and which run belongs to which is not known; "
+            f"{where}: the time goes back {times_in}, so the runs of the tables cannot be matched; "
             "give each run files of its own"
         )
     times = [table.logged for table in tables.values()]

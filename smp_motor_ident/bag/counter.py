@@ -1,4 +1,5 @@
-"""Counters and angles that wrap around, at which width, and counters that start again."""
+# SPDX-License-Identifier: Apache-2.0
+"""Unwrap counters and angles, estimate their width, and detect resets."""
 
 import math
 from dataclasses import dataclass, field
@@ -12,15 +13,15 @@ from smp_motor_ident.errors import BagError
 from smp_motor_ident.finding import Finding
 
 _WIDTHS = (32, 24, 20, 18, 17, 16, 15, 14, 13, 12, 11, 10, 8)
-_LEAST = 3  # wraps that tell a width; fewer may be faults
-_ONWARD = 0.8
-"""Share of the wraps before and after which it moves on; what is thrown to and fro stands."""
-_TURNS = 10  # angles start again after up to so many turns, or at up to so many parts of one
+_MIN_WRAPS = 3  # wraps needed to estimate a width; fewer may be faults
+_MIN_MOVING_SHARE = 0.8
+"""Share of wraps with motion before and after; a counter that toggles stands still."""
+_MAX_TURNS = 10  # an angle wraps after at most this many turns, or fractions of one
 
 
 @dataclass(frozen=True)
 class Wrap:
-    """The width at which a signal starts again, and how sure it is."""
+    """The width at which a signal wraps, with its uncertainty."""
 
     width: float
     deviation: float  # standard deviation of the width
@@ -32,21 +33,21 @@ class Wrap:
         return self.deviation < WIDTH_KNOWN.value * self.width
 
     def admits(self, width: float) -> bool:
-        """Return whether a width is what the signal shows, within four deviations."""
+        """Return whether a width agrees with the signal within four standard deviations."""
         return abs(width - self.width) <= 4 * self.deviation + 1e-6 * self.width
 
 
 def wrap_of(value: Array) -> Wrap | None:
-    """Return the width at which a signal wraps; None where it evidently does not.
+    """Return the width at which a signal wraps; None if it evidently does not.
 
-    It nears an end of its range, jumps to the other end, and goes on the same way.  The jump and
-    the step that was due instead are the width together.
+    A wrapping signal approaches an end of its range, jumps to the other end and continues in the
+    same direction.  The width is the jump plus the expected step.
     """
     steps = np.diff(value)
     span = float(np.ptp(value)) if value.size else 0.0
     jumps = np.flatnonzero(np.abs(steps) > span / 2)
     usual = np.delete(np.abs(steps), jumps)
-    if jumps.size < _LEAST or not usual.size or usual.max() > span / 4:
+    if jumps.size < _MIN_WRAPS or not usual.size or usual.max() > span / 4:
         return None
     small = steps.copy()
     small[jumps] = np.nan
@@ -54,17 +55,17 @@ def wrap_of(value: Array) -> Wrap | None:
     after = np.stack([_at(small, jumps + k) for k in (1, 2, 3)])
     seen = np.isfinite(before).any(axis=0) & np.isfinite(after).any(axis=0)
     jump = steps[jumps[seen]]
-    if jump.size < _LEAST:
+    if jump.size < _MIN_WRAPS:
         return None
     due = [np.nanmean(side[:, seen], axis=0) for side in (before, after)]
-    if min(np.mean(np.sign(jump) * side < 0) for side in due) < _ONWARD:
+    if min(np.mean(np.sign(jump) * side < 0) for side in due) < _MIN_MOVING_SHARE:
         return None
     widths = np.abs(jump) - np.sign(jump) * (due[0] + due[1]) / 2
     width = float(np.median(widths))
     scatter = 1.4826 * float(np.median(np.abs(widths - width)))
     if scatter > 0.1 * width or width < 0.95 * span:
         return None
-    # The step that was due lies between those before and after, or little beyond.
+    # The expected step lies between those before and after, or slightly beyond.
     scatter = max(scatter, float(np.median(np.abs(due[1] - due[0]))) / 2, 1e-9 * width)
     return Wrap(width, 1.2533 * scatter / np.sqrt(jump.size - 1), jump.size)
 
@@ -80,7 +81,7 @@ def counts_of(wrap: Wrap, span: int) -> int:
 
 def angle_of(wrap: Wrap) -> float:
     """Return the width in radians: the whole number or part of turns that a wrap admits."""
-    turns = [*range(1, _TURNS + 1), *(1 / k for k in range(2, _TURNS + 1))]
+    turns = [*range(1, _MAX_TURNS + 1), *(1 / k for k in range(2, _MAX_TURNS + 1))]
     return next((w for n in turns if wrap.admits(w := 2 * np.pi * n)), wrap.width)
 
 
@@ -108,29 +109,29 @@ class Unwrapped:
 def unwrap(count: Integers, bits: int | None, expected: Array | None = None) -> Unwrapped:
     """Undo the wrap-around of a counter, and find where it was reset.
 
-    A width of None is found by jumps of one power of two; 0 never wraps.  ``expected`` counts from
-    sample to sample, by a measured speed, decide between wrap and reset, and help a narrow
-    counter that turns more than half of its range between two samples.
+    A width of None is found by jumps of one power of two; 0 never wraps.  ``expected`` counts
+    between samples, by a measured speed, decide between wrap and reset, and resolve a narrow
+    counter that turns by more than half of its range between two samples.
     """
     if count.size < 2:
         return Unwrapped(count, np.zeros(0, np.int64))
     findings = []
     steps = np.diff(count)  # modulo 2^64, as is right for a counter of that width
     guess = np.zeros(steps.size) if expected is None else np.nan_to_num(expected)
-    if bits is None and (width := _width_shown(count, steps, guess)):
+    if bits is None and (width := _estimate_width(count, steps, guess)):
         if width & (width - 1):
-            text = f"the encoder starts again at {width} counts by what it shows; that is undone"
+            text = f"the encoder starts again at {width} counts; it was unwrapped"
             whole = np.rint(undone(count.astype(np.float64), width)).astype(np.int64)
             findings.append(found("counter_wraps", text, counts=width))
             return Unwrapped(whole, np.zeros(0, np.int64), findings)
         bits = width.bit_length() - 1
-        text = f"the encoder wraps at 2^{bits} counts by what it shows; wrap undone"
+        text = f"the encoder wraps at 2^{bits} counts; it was unwrapped"
         findings.append(found("counter_wraps", text, bits=bits))
     if bits:
         near = np.rint(guess).astype(np.int64)
         shift = np.int64(64 - bits)
         steps = near + (((steps - near) << shift) >> shift)
-    resets = _resets(count, steps, guess, expected is not None) + 1
+    resets = _find_resets(count, steps, guess, expected is not None) + 1
     if resets.size:
         findings.append(reset_found("encoder's counter", resets.size))
         steps = steps.copy()
@@ -144,27 +145,27 @@ def unwrap(count: Integers, bits: int | None, expected: Array | None = None) -> 
 
 
 def reset_found(what: str, times: int) -> Finding:
-    """Say that a counter or an angle began anew."""
+    """Report resets of a counter or an angle."""
     text = f"the {what} was reset {times} times; a new segment each"
     return found("counter_reset", text, "warning", times=times)
 
 
-def _width_shown(count: Integers, steps: Integers, guess: Array) -> int:
-    """Return at how many counts a counter starts again by what it shows; 0 where it does not."""
+def _estimate_width(count: Integers, steps: Integers, guess: Array) -> int:
+    """Return the count at which a counter restarts, estimated from its data; 0 if none."""
     bits = _width(steps, guess)
     wrap = wrap_of(count.astype(np.float64))
     if wrap is None or (bits and wrap.admits(2.0**bits)):
         return 2**bits if bits else 0
     if not wrap.is_known:
         raise BagError(
-            f"the encoder's count starts again {wrap.times} times, at about {wrap.width:.4g}, and "
-            "no more is known of where; record faster, or a counter that goes on"
+            f"the encoder's count starts again {wrap.times} times, at about {wrap.width:.4g} "
+            "counts, but its range is uncertain; record faster, or a continuous counter"
         )
     return counts_of(wrap, int(np.ptp(count)))
 
 
 def is_full(count: Integers) -> int:
-    """Return the last number of a width where a counter stays at it, or 0."""
+    """Return the end of a range at which a counter stays, or 0."""
     for last in (int(count.max()), int(count.min())) if count.size > 1 else ():
         size = last + 1 if last > 0 else -last  # 2^k - 1 at the upper end, -2^k at the lower
         stays = np.mean((count[1:] == last) & (count[:-1] == last)) > SATURATED.value
@@ -173,7 +174,7 @@ def is_full(count: Integers) -> int:
     return 0
 
 
-def _usual(steps: Integers, guess: Array) -> float:
+def _bound_steps(steps: Integers, guess: Array) -> float:
     """Return a bound that the steps of a turning motor do not reach."""
     size = np.abs(steps - guess)
     return 10.0 * float(np.quantile(size, 0.9)) + 100.0
@@ -182,7 +183,7 @@ def _usual(steps: Integers, guess: Array) -> float:
 def _width(steps: Integers, guess: Array) -> int:
     """Return the width at which a counter evidently wraps, or 0."""
     rest = steps - guess
-    large = np.abs(rest) > _usual(steps, guess)
+    large = np.abs(rest) > _bound_steps(steps, guess)
     if not large.any() or large.mean() > 0.05:
         return 0
     for bits in _WIDTHS:
@@ -193,10 +194,10 @@ def _width(steps: Integers, guess: Array) -> int:
     return 0
 
 
-def _resets(count: Integers, steps: Integers, guess: Array, measured: bool) -> Integers:
+def _find_resets(count: Integers, steps: Integers, guess: Array, measured: bool) -> Integers:
     """Return the steps at which the counter fell to about zero without having turned there."""
     far = 0.0 if measured else 5 * max(float(np.quantile(np.abs(steps), 0.99)), 1.0)
-    return _falls(count, np.abs(steps - guess), _usual(steps, guess), far)
+    return _find_falls(count, np.abs(steps - guess), _bound_steps(steps, guess), far)
 
 
 def angle_resets(angle: Array) -> Integers:
@@ -206,13 +207,13 @@ def angle_resets(angle: Array) -> Integers:
     if not moves.size:
         return np.zeros(0, np.int64)
     usual, most = np.quantile(moves, (0.9, 0.99))
-    return _falls(angle, steps, 10 * float(usual), 5 * float(most)) + 1
+    return _find_falls(angle, steps, 10 * float(usual), 5 * float(most)) + 1
 
 
-def _falls(value: Array | Integers, rest: Array, bound: float, far: float) -> Integers:
+def _find_falls(value: Array | Integers, rest: Array, bound: float, far: float) -> Integers:
     """Return the steps to about zero that are beyond a bound, and farther, than others are."""
     fell = (rest > bound) & (np.abs(value[1:]) < bound) & (np.abs(value[:-1]) > bound)
-    # A reset is one jump between usual steps: what jumps to and fro is noise, not a reset.
+    # A reset is one jump between usual steps; jumps to and fro are noise.
     usual = rest <= bound
     fell[1:] &= usual[:-1]
     fell[:-1] &= usual[1:]
@@ -223,7 +224,7 @@ def _falls(value: Array | Integers, rest: Array, bound: float, far: float) -> In
 
 
 def unwrap_angle(angle: Array) -> tuple[Array, float]:
-    """Undo the wrap-around of an angle; return the width of it, too, 0 where there is none.
+    """Unwrap an angle; return it and the width of its wrap, 0 if it has none.
 
     Within one turn, jumps of more than half of it are wraps.
     """
@@ -241,7 +242,7 @@ def unwrap_angle(angle: Array) -> tuple[Array, float]:
         if width == wrap.width and not wrap.is_known:
             raise BagError(
                 f"the position starts again {wrap.times} times, at about {wrap.width:.4g} rad, "
-                "which is no turn or part of one; record faster, or an angle that goes on"
+                "which is not a turn or a part of one; record faster, or a continuous angle"
             )
     result = angle.copy()
     result[sound] = undone(values, width)
@@ -250,10 +251,10 @@ def unwrap_angle(angle: Array) -> tuple[Array, float]:
 
 
 def check_aliasing(steps: Array, width: float, what: str) -> None:
-    """Refuse what turns by more than half of its width from sample to sample.
+    """Refuse a signal that turns by more than half of its width between samples.
 
-    Fast turning then goes over into fast turning backwards without slowing down: several times, or
-    once for long at either side.
+    Fast rotation then changes into fast reverse rotation without slowing down, several times, or
+    once with long runs on either side.
     """
     if np.abs(steps).max(initial=0.0) < ALMOST_HALF.value * width:
         return
@@ -265,6 +266,6 @@ def check_aliasing(steps: Array, width: float, what: str) -> None:
     once = over & (fast[:-5] == before) & (after == fast[5:]) & edge[2:-3] & edge[3:-2]
     if np.count_nonzero(over) + ALIASED.value * np.count_nonzero(once) >= ALIASED.value:
         raise BagError(
-            f"the {what} turns by more than half of its {width:.4g} from sample to sample, where "
-            "nobody can tell which way; record it at least twice as often, or record the speed"
+            f"the {what} turns by more than half of its {width:.4g} from sample to sample, so "
+            "its direction is ambiguous; record it at least twice as often, or record the speed"
         )

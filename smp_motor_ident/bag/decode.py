@@ -1,8 +1,9 @@
-"""From messages to columns of numbers: one template reads all messages of a layout at once.
+# SPDX-License-Identifier: Apache-2.0
+"""Decode messages into columns of numbers: one template reads all messages of a layout at once.
 
-The position of a number depends on nothing but the lengths of the strings and sequences
-before it: messages of one topic that agree in these have their numbers at the same places, and
-one indexing per field reads them all.
+The position of a number depends only on the lengths of the strings and sequences before it:
+messages of a topic that agree in these have their numbers at the same places, and one indexing per
+field reads them all.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -23,12 +24,12 @@ from smp_motor_ident.bag.unpack import Budget, decompress_messages
 from smp_motor_ident.errors import BagError
 
 Part = tuple[NDArray[np.int64], list[NDArray[Any] | None]]
-"""Which messages of a batch agree, and their columns; a column is None where they have none."""
+"""Messages of a batch with the same layout, and their columns; None for a missing column."""
 
 
 @dataclass(frozen=True, eq=False)
 class Layout:
-    """Where the wanted numbers lie in all messages that agree with one template."""
+    """Positions of the wanted numbers in all messages of one layout."""
 
     length: int
     checks: tuple[tuple[int, int], ...]
@@ -46,14 +47,14 @@ class Layout:
 
 
 class Decoder:
-    """Reads the wanted fields of one channel, by the first candidate that fits a message."""
+    """Decoder of the wanted fields of a channel, by the first definition that fits a message."""
 
     KEPT, FEW = 64, 2
-    """Layouts that are kept; few where nearly every message has one of its own."""
+    """Largest number of stored layouts."""
     TRIED = 200
-    """Messages in a row that are no such messages, behind which none is taken apart any more."""
+    """Undecodable messages in a row after which decoding stops."""
     TOGETHER = 1024
-    """Messages that are compared with the layouts at once."""
+    """Messages compared with the layouts at once."""
 
     def __init__(
         self, channel: Channel, candidates: Iterable[Definitions], paths: Sequence[str]
@@ -69,7 +70,7 @@ class Decoder:
         self.reason = ""
 
     def decode(self, batch: Batch) -> list[Part]:
-        """Decode a batch; messages that are no such messages are missing and counted."""
+        """Decode a batch; skip and count the messages that cannot be decoded."""
         every = np.arange(len(batch))
         begins = range(0, every.size, self.TOGETHER)
         return [p for k in begins for p in self._decode(batch, every[k : k + self.TOGETHER])]
@@ -94,8 +95,8 @@ class Decoder:
         return parts
 
     def _learn(self, data: bytes) -> bool:
-        """Take a message as template; False where it cannot be taken apart."""
-        # None is looked for before the others have failed.
+        """Add a message's layout; return False if it cannot be decoded."""
+        # Look for a new layout only after the others have failed.
         self._candidates, candidates = tee(self._candidates)
         for definitions in candidates:
             try:
@@ -143,13 +144,13 @@ STAMP = ("header.stamp.sec", "header.stamp.nanosec")
 
 
 class _Collector:
-    """Grows one topic's columns batch by batch."""
+    """Collector of one topic's columns."""
 
     def __init__(self, topic: str, paths: list[str], types: Types, budget: Budget) -> None:
         self.topic, self.paths, self.types, self.budget = topic, paths, types, budget
         self._decoders: dict[tuple[str, str, str], Decoder] = {}
         self._count = 0
-        # Of each part, whose messages have one layout: which messages, and what they hold
+        # Message indices and decoded values of each part, whose messages share a layout
         self._rows: list[Integers] = []
         self._log: list[Integers] = []
         self._number: list[Integers | None] = []
@@ -189,7 +190,7 @@ class _Collector:
         return self._decoders[key]
 
     def table(self) -> Table:
-        """Return what was collected, in the order of the messages, and forget it."""
+        """Return the collected columns in the order of the messages, and clear them."""
         none = np.zeros(0, np.int64)
         rows = np.concatenate([none, *self._rows])
         order = slice(None) if np.all(np.diff(rows) > 0) else np.argsort(rows)
@@ -215,7 +216,8 @@ class _Collector:
         table = Table(log, _stamps(columns), columns, present, number)
         for decoder in self._decoders.values():
             if decoder.undecodable:
-                text = f"{decoder.undecodable} messages are no {decoder.name} ({decoder.reason})"
+                text = f"{decoder.undecodable} messages are not of type {decoder.name}"
+                text += f" ({decoder.reason})"
                 table.findings.append(damaged(f"{self.topic}: {text} and were left out"))
         if self.packed:
             text = f"{self.topic}: {self.packed} messages could not be decompressed"

@@ -1,4 +1,5 @@
-"""Whether one signal drives another: what tells a voltage and its motion from other fields."""
+# SPDX-License-Identifier: Apache-2.0
+"""Test whether one signal drives another, to find a voltage and its motion among fields."""
 
 from itertools import product
 
@@ -8,20 +9,23 @@ from scipy.special import fdtrc, ndtri
 
 from smp_motor_control.arrays import Array, Integers
 from smp_motor_ident.bag.limits import BEHIND_GAIN, BEHIND_LEFT, EXPLAINS
-from smp_motor_ident.diagnosis.limits import HALF_EXPLAINED
-from smp_motor_ident.likelihood.first_order_lag import lagged
+from smp_motor_ident.quality.lag import lagged
+from smp_motor_ident.quality.limits import HALF_EXPLAINED
 
 LAGS, OWN = 6, 2
-MOST_BEHIND = 200  # rows by which a command is looked for behind its motion
-NEARLY, ALIKE = 0.9, 3.0  # of what is left at other shifts: clearly less, and much the same
-AROUND = 20  # steps from about where a command stands to where it does
+MAX_DELAY_ROWS = 200  # largest delay of a command behind its motion that is searched [rows]
+CLEAR_RATIO, SIMILAR_RATIO = (
+    0.9,
+    3.0,
+)  # ratio to the residual at other shifts: clearly smaller; similar
+FINE_SEARCH_ROWS = 20  # rows searched around a coarse estimate of the shift
 SECOND = (0.0, 0.5, 1.0, 2.0)  # rows of a second lag
-SAMPLED = 5000  # rows that a fit is made of
-BLOCKS = 200  # stretches over which motions are averaged: in them a counter's noise is small
+MAX_FIT_ROWS = 5000  # rows used for a fit
+BLOCKS = 200  # averaged stretches of a motion, which reduce a counter's noise
 
 
 def unexplained(u: Array, y: Array) -> float | None:
-    """Return the share of a motion that a voltage leaves unexplained; None where it explains none.
+    """Return the share of a motion that a voltage leaves unexplained; None if it explains nothing.
 
     Its past must predict the motion better than the motion's own past does (Granger's test, an F
     test of two nested regressions).
@@ -44,12 +48,11 @@ def unexplained(u: Array, y: Array) -> float | None:
 
 
 def answers_in_its_row(u: Array, y: Array) -> bool:
-    """Return whether a motion answers a command in the very row in which the command is new.
+    """Return whether a motion responds to a command in the same row.
 
-    Then the command is that of the interval that ends at the row: what begins there cannot have
-    moved anything yet.  The increments of a motion that is driven jump where the drive does; the
-    jumps at steps of a held command are held against those elsewhere (a normal test).  A motion
-    that is NaN, such as where another run begins, tells nothing.
+    Then the command acts over the interval that ends at the row, since a later one could not have
+    moved anything yet.  The increments of a driven motion jump with its drive: the jumps at steps
+    of a held command are compared with those elsewhere (a normal test).  NaN is ignored.
     """
     steps, jumps = np.diff(u), np.diff(y, 2)
     held = (steps[1:-1] != 0) & (steps[:-2] == 0)  # a new command behind one that was held
@@ -63,45 +66,47 @@ def answers_in_its_row(u: Array, y: Array) -> bool:
 
 
 def follows(u: Array, y: Array) -> tuple[float, bool]:
-    """Return how much of a signal follows another late, and whether it is the sum of what does.
+    """Return the share of a signal that follows another with a lag, and whether it is an integral.
 
-    Most of it must be a lag of the first order of the other, or its increments must; and more so
-    than the other as it is: what is at once (a speed beside its angle, an error) drives nothing.
+    The signal or its increments must be mostly a first-order lag of the other, and fit that better
+    than the other without lag: a simultaneous signal (speed and angle, an error) drives nothing.
     """
     if np.count_nonzero(np.diff(u)) < LAGS or _is_clock(u) or _is_clock(y):
         return 0.0, False
     steps = np.diff(y, prepend=y[:1])
-    itself = late(u, y) if _alike(u, steps) < HALF_EXPLAINED.value else 0.0
+    itself = late(u, y) if _explained_share(u, steps) < HALF_EXPLAINED.value else 0.0
     return max((itself, False), (late(u, steps), True))
 
 
 def rows_behind(u: Array, y: Array) -> int:
-    """Return by how many rows a command stands behind the motion that it drives; 0 where it leads.
+    """Return the number of rows by which a command is recorded late; 0 if it leads the motion.
 
-    A cross-correlation of lags of the first order with the motion tells about where; around it,
-    friction and the lag are fitted at every shift.  A motion that was smoothed over a window both
-    ways is one that was averaged over it as it came, ahead by half of it.
+    A cross-correlation of first-order lags with the motion gives a coarse shift; around it,
+    friction and the lag are fitted at every shift.  A motion smoothed in both directions leads by
+    half of its window.
     """
-    most = min(y.size // 10, MOST_BEHIND)
+    most = min(y.size // 10, MAX_DELAY_ROWS)
     u, y = u - u.mean(), y - y.mean()
     if most < 4 or not (np.any(u) and np.any(y)):
         return 0
     shifts = np.arange(-most, most + 1)
     lags = np.geomspace(0.5, y.size / 20, 12)
-    shares = np.array([_alike_shifted(lagged(u - u[0], float(lag)), y, shifts) for lag in lags])
+    shares = np.array(
+        [_explained_shares_by_shift(lagged(u - u[0], float(lag)), y, shifts) for lag in lags]
+    )
     rest = 1 - shares.max(axis=0)
     about = int(shifts[np.argmin(rest)])
-    # Of a periodic motion much the same is left a period, or half of it, nearer to none
-    nearer = shifts[(rest < ALIKE * rest.min()) & (np.abs(shifts) < abs(about) - 10)]
+    # For a periodic motion, the residual is similar a period, or half of one, nearer to zero
+    nearer = shifts[(rest < SIMILAR_RATIO * rest.min()) & (np.abs(shifts) < abs(about) - 10)]
     about = min([about, *nearer.tolist()], key=abs)
-    if not 0 < about < most or rest[most + about] > NEARLY * rest[: most + 1].min():
+    if not 0 < about < most or rest[most + about] > CLEAR_RATIO * rest[: most + 1].min():
         return 0
     lag = float(lags[np.argmax(shares.max(axis=1))])
-    left = {shift: _left(u, y, shift, lag) for shift in range(-3, 1)}
+    left = {shift: _residual_share(u, y, shift, lag) for shift in range(-3, 1)}
     best = about
-    for _ in range(AROUND):  # towards where least is left
+    for _ in range(FINE_SEARCH_ROWS):  # towards the smallest residual
         near = range(max(best - 2, 1), min(best + 2, most) + 1)
-        left |= {shift: _left(u, y, shift, lag) for shift in near if shift not in left}
+        left |= {shift: _residual_share(u, y, shift, lag) for shift in near if shift not in left}
         if (least := min(near, key=left.__getitem__)) == best:
             break
         best = least
@@ -109,8 +114,8 @@ def rows_behind(u: Array, y: Array) -> int:
     return best if left[best] < min(BEHIND_LEFT.value, BEHIND_GAIN.value * leading) else 0
 
 
-def _alike_shifted(x: Array, y: Array, shifts: Integers) -> Array:
-    """Return which share of ``y[k]`` a multiple of ``x[k + shift]`` explains at each shift."""
+def _explained_shares_by_shift(x: Array, y: Array, shifts: Integers) -> Array:
+    """Return the share of ``y[k]`` explained by a multiple of ``x[k + shift]`` at each shift."""
     x = x - x.mean()
     both = correlate(x, y, "full")[y.size - 1 + shifts]
     own, moved = (np.concatenate([[0.0], np.cumsum(v**2)]) for v in (x, y))
@@ -119,10 +124,10 @@ def _alike_shifted(x: Array, y: Array, shifts: Integers) -> Array:
     return np.asarray(both**2 / np.where(size > 0, size, np.inf))
 
 
-def _left(u: Array, y: Array, shift: int, lag: float) -> float:
-    """Return which share of a motion a shifted command leaves, behind a lag and friction."""
+def _residual_share(u: Array, y: Array, shift: int, lag: float) -> float:
+    """Return the unexplained share of a motion for a shifted command with lag and friction."""
     u, y = (u[shift:], y[: y.size - shift]) if shift > 0 else (u[: u.size + shift], y[-shift:])
-    every = max(y.size // SAMPLED, 1)
+    every = max(y.size // MAX_FIT_ROWS, 1)
     best = np.inf
     for trial, second in product(lag * np.geomspace(0.4, 2.5, 25), SECOND):
         columns = (lagged(u, trial), lagged(np.sign(y), trial), np.ones(y.size))
@@ -134,14 +139,14 @@ def _left(u: Array, y: Array, shift: int, lag: float) -> float:
 
 
 def late(u: Array, y: Array) -> float:
-    """Return which share of a signal a lag of another explains; 0 where that is not its best."""
+    """Return the share of a signal explained by a lag of another; 0 if another shift is better."""
     lags = np.geomspace(1.0, max(y.size / 20, 2.0), 8)
-    share = max(_alike(lagged(u - u[0], float(lag)), y) for lag in lags)
-    return share if share > max(HALF_EXPLAINED.value, _alike(u, y)) else 0.0
+    share = max(_explained_share(lagged(u - u[0], float(lag)), y) for lag in lags)
+    return share if share > max(HALF_EXPLAINED.value, _explained_share(u, y)) else 0.0
 
 
 def clock_of(values: list[Array]) -> int | None:
-    """Return which of several columns is the time: the one that rises most evenly."""
+    """Return the column of time: the one that rises most evenly."""
     uneven = {k: np.std(np.diff(x)) / np.ptp(x) for k, x in enumerate(values) if _is_clock(x)}
     return min(uneven, key=lambda k: float(uneven[k]), default=None)
 
@@ -155,8 +160,8 @@ def _is_clock(column: Array) -> bool:
     return bool(low > 0.5 * high)
 
 
-def _alike(x: Array, y: Array) -> float:
-    """Return which share of the second a positive multiple of the first explains."""
+def _explained_share(x: Array, y: Array) -> float:
+    """Return the share of the second explained by a positive multiple of the first."""
     every = max(y.size // BLOCKS, 1)
     x, y = (v[: v.size // every * every].reshape(-1, every).mean(axis=1) for v in (x, y))
     x, y = x - x.mean(), y - y.mean()

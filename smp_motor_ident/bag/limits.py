@@ -1,9 +1,10 @@
+# SPDX-License-Identifier: Apache-2.0
 """Every threshold of a decision about recordings, with its unit and its reason.
 
 Printed with the others in ``docs/limits.md``.
 """
 
-from smp_motor_ident.diagnosis.limits import Limit
+from smp_motor_ident.limits import Limit
 
 UNPACKED_LEAST = Limit(
     256e6,
@@ -45,7 +46,7 @@ JUMP_SPAN = Limit(
 JUMP_STEP = Limit(
     20.0,
     "1",
-    "physical: what has inertia does not step to and fro by twenty times all but 1 % of its steps",
+    "physical: inertia forbids steps to and fro of twenty times the 99 % quantile of the steps",
     "test_checks.py",
 )
 UNSIGNED_CURRENT = Limit(
@@ -64,8 +65,8 @@ BEHIND_LEFT = Limit(
 BEHIND_GAIN = Limit(
     0.6,
     "1",
-    "cost: what no shift forward explains must shrink by two fifths; friction and a winding leave "
-    "as much at every shift",
+    "cost: the residual without a shift must shrink by two fifths; with friction and a winding it "
+    "is the same at every shift",
     "test_late_voltage.py",
 )
 EXPLAINS = Limit(

@@ -1,4 +1,5 @@
-"""Which topic, field or column is which signal of which motor, and in what unit.
+# SPDX-License-Identifier: Apache-2.0
+"""Assign topics, fields and columns to the motors' signals, with their units.
 
 The same mapping is written as a YAML file or as strings on the command line; docs/mapping.md
 shows both.
@@ -20,7 +21,7 @@ from smp_motor_ident.errors import BagError, ParameterError
 
 SIGNALS = ("voltage", "current", "velocity", "position", "count", "supply", "direction", "time")
 DESCRIBED = ("gear_ratio", "counts_per_revolution", "encoder_bits", "supply_voltage", "resistance")
-"""What a ``motor_description`` tells of the hardware."""
+"""Properties of the hardware in a ``motor_description``."""
 ACCURACIES = ("current_accuracy", "voltage_accuracy", "timing_accuracy")
 HARDWARE = (*DESCRIBED, *ACCURACIES)
 _CHOICES = {
@@ -42,13 +43,13 @@ _SPEC = re.compile(
     re.VERBOSE,
 )
 _BETWEEN = re.compile(r"""\s+(?=[\w./]+=[^=])(?=(?:[^"]*"[^"]*")*[^"]*$)""")
-"""Blanks that stand before another ``KEY=``, but for those in quotes."""
+"""Blanks before another ``KEY=``, except in quotes."""
 _TOPIC = re.compile(r"(?P<topic>/[\w/-]+)\.(?P<field>.+)")
 
 
 @dataclass(frozen=True)
 class Signal:
-    """Where one signal comes from; its value is ``(raw * scale + offset)`` in ``unit``."""
+    """Source of one signal; its value is ``(raw * scale + offset)`` in ``unit``."""
 
     topic: str  # empty for a column of a file; ``/STEM`` where several files are one recording
     field: str  # path of the field, or name of the column
@@ -61,10 +62,10 @@ class Signal:
 
 @dataclass(frozen=True)
 class MotorMap:
-    """Signals of one motor and what is known of its hardware."""
+    """Signals and hardware of one motor."""
 
     signals: Mapping[str, Signal] = field(default_factory=dict)  # by the names in `SIGNALS`
-    # Any of `HARDWARE`; what is given here goes before the bag's own description
+    # Any of `HARDWARE`; overrides the bag's own description
     hardware: Mapping[str, float] = field(default_factory=dict)
     held: str = ""  # whether a voltage holds from its instant on, or held up to it
     clock: str = "auto"  # which time the samples have
@@ -74,8 +75,8 @@ class MotorMap:
     sample_time: float = 0.0  # [s]; of a file that has no time; 0 where it has
     velocity_window: float = 0.0  # [s]; over which the velocity is known to be averaged
     wheel_radius: float = 0.0  # [m]; for velocities and positions of the rim
-    pwm_full_scale: float = 0.0  # what a voltage in ``pwm`` is at 100 %; it is never guessed
-    own: bool = False  # whether these are our own messages, of which nothing has to be guessed
+    pwm_full_scale: float = 0.0  # value of a voltage in ``pwm`` at 100 %; never guessed
+    own: bool = False  # whether these are the project's own messages, fully described
 
     @property
     def topics(self) -> tuple[str, ...]:
@@ -88,7 +89,7 @@ class SignalMap:
     """A whole mapping."""
 
     motors: Mapping[str, MotorMap] = field(default_factory=dict)  # by the name of the wheel
-    # What holds for all motors, also those that the bag describes itself
+    # Settings of all motors, also of those that the bag describes itself
     defaults: MotorMap = field(default_factory=MotorMap)
     # ``.msg`` files or folders of them for types that the bag does not define
     msg_files: tuple[str, ...] = ()
@@ -161,7 +162,7 @@ def from_document(document: Any, where: str = "mapping") -> SignalMap:
     for wheel in map(str, motors):
         if not is_ros_name(wheel):
             raise BagError(
-                f"{where}: {wheel!r} is no ROS name; use letters, digits and _ as left_1"
+                f"{where}: {wheel!r} is not a ROS name; use letters, digits and _ as left_1"
             )
     each = {str(w): _motor(entry, f"{where}: {w}", defaults) for w, entry in motors.items()}
     return SignalMap(each, defaults, tuple(types))
@@ -183,7 +184,7 @@ def of(mapping: Any) -> SignalMap:
 
 
 def _motor(entry: Any, where: str, defaults: MotorMap | None = None) -> MotorMap:
-    """Return one motor's part, validated, on top of what holds for all."""
+    """Return one motor's part, validated, with the common settings as defaults."""
     if not isinstance(entry, Mapping):
         raise BagError(f"{where}: must hold keys and values")
     motor = defaults or MotorMap()
@@ -201,7 +202,7 @@ def _motor(entry: Any, where: str, defaults: MotorMap | None = None) -> MotorMap
             options[key] = _choice(key, value, place)
         else:
             known = ", ".join((*SIGNALS, *HARDWARE, *_CHOICES, *_SECONDS, *_SCALES))
-            raise BagError(f"{place} is no key of a mapping; use {known}")
+            raise BagError(f"{place} is not a key of a mapping; use {known}")
     if (bits := hardware.get("encoder_bits", 0)) != int(bits) or bits > 64:
         raise BagError(f"{where}: encoder_bits is {bits}; it must be a whole number from 0 to 64")
     return replace(motor, signals=signals, hardware=hardware, **options)
@@ -245,7 +246,7 @@ def _signal(name: str, value: Any, place: str) -> Signal:
     if isinstance(value, Mapping):
         unknown = set(value) - {"topic", "field", "column", "scale", "offset", "unit", "shaft"}
         if unknown:
-            raise BagError(f"{place}: {sorted(unknown)[0]!r} is no key of a signal")
+            raise BagError(f"{place}: {sorted(unknown)[0]!r} is not a key of a signal")
         source = value.get("field", value.get("column"))
         if not isinstance(source, str):
             raise BagError(f"{place}: needs topic and field, or a column")
@@ -255,7 +256,7 @@ def _signal(name: str, value: Any, place: str) -> Signal:
         signal = Signal(topic, source, scale, offset, unit, shaft)
     else:
         signal = _written(str(value), place)
-    constant = name == "voltage" and signal.offset != 0  # a level that no column holds
+    constant = name == "voltage" and signal.offset != 0  # a constant level
     if not (signal.scale or constant) or not math.isfinite(signal.scale):
         raise BagError(f"{place}: a scale of {signal.scale} leaves nothing of the signal")
     if signal.shaft:

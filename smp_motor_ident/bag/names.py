@@ -1,4 +1,5 @@
-"""What fields are called: which signal of which wheel a name may mean, and in which unit."""
+# SPDX-License-Identifier: Apache-2.0
+"""Guess a field's signal, wheel and unit from its name."""
 
 import re
 from collections.abc import Sequence
@@ -9,7 +10,7 @@ WORDS_OF_VOLTS = (
 )
 WORDS_OF_RADIANS = r"rad|omega|ω|(?:^|\W|_)w(?:$|\W|_)"
 ROLES = {
-    # What a field or its topic is called, the most telling first.
+    # Patterns of field and topic names, the most specific first.
     "direction": r"(?:^|\W|_)dir(?:ection)?(?:$|\W|_)|richtung|sentido|direcci",
     "voltage": WORDS_OF_VOLTS + r"|pwm|duty|throttle|entrada|eingang|^in$|(?:^|\W|_)power(?:$|\W|_)"
     r"|esfor[çc]o|esfuerzo|(?:^|\W|_)(?:cmd|command|effort|u|input|v_?in)(?:$|\W|_)",
@@ -25,12 +26,12 @@ ROLES = {
 MOTIONS = ("velocity", "position", "count")
 NO_VOLTAGE = r"twist|cmd_vel|linear|angular|batter|supply|vbat"
 TORQUE = r"effort"
-"""What is a torque [N m] in ``sensor_msgs/JointState``, and the command of some drivers."""
+"""A torque [N m] in ``sensor_msgs/JointState``; some drivers put their command there."""
 ELSEWHERE = (
     r"pose(?:$|\W|_|[A-Z])|orientation|quaternion|(?:^|\W|_)(?:linear|angular)(?:$|\W|_)|translation"
     r"|transform|accel|gyro|magnet|(?:^|\W|_)(?:odom|gps|imu|point)(?:$|\W|_)"
 )
-"""What is of the robot's place and not of a motor."""
+"""Names of the robot's pose, which belong to no motor."""
 DRIVES = WORDS_OF_VOLTS + r"|pwm|duty|throttle"
 SPEED_COMMAND = (
     r"twist|cmd_vel|vel_cmd|(?:speed|velocity|rpm)_(?:cmd|command|setpoint|set_point|target|ref)"
@@ -52,7 +53,7 @@ _SIDES = (
     *("izq", "esquerda", "direita", "esquerdo", "direito", "sinistra", "destra"),
 )
 _LETTER = re.compile(r"(.*?)[\W_]*([abclrABCLR]|\d)(?:[\W_]*[\[(].*)?")
-"""A name that ends in the letter or digit of one motor of several, but for a unit behind it."""
+"""A name that ends in the letter or digit of a motor, before an optional unit."""
 _LETTERS = {"l": "left", "r": "right"}
 
 
@@ -62,9 +63,9 @@ _NAMED = re.compile(_MOTOR, re.IGNORECASE)
 
 
 def tells_motors(column: str, words: Sequence[str] = ()) -> bool:
-    """Return whether a column says of which motor its rows are: ``motor_id``.
+    """Return whether a column names the motor of each row: ``motor_id``.
 
-    One that is called ``wheel`` alone does where its words are sides, letters or numbered.
+    A column called ``wheel`` alone does if its words are sides, letters or numbered.
     """
     sided = (wheel_of(word) or re.fullmatch(r".*\d|[A-Za-z]", word) for word in words)
     named = bool(words and _NAMED.fullmatch(column.strip())) and all(sided)
@@ -72,23 +73,23 @@ def tells_motors(column: str, words: Sequence[str] = ()) -> bool:
 
 
 def worded(name: str) -> str:
-    """Return a name whose words are apart: ``velLeft`` is ``vel_Left``, ``u2`` is ``u_2``."""
+    """Return a name with its words separated: ``velLeft`` is ``vel_Left``, ``u2`` is ``u_2``."""
     return re.sub(r"(?<=[a-z\d])(?=[A-Z])|(?<=[A-Za-z])(?=\d+$)", "_", name)
 
 
 def role_of(topic: str, path: str) -> str:
-    """Return what a field is by its own name, or else by what it is a part of, or its topic."""
+    """Return a field's role by its own name, else by its parent's, else by its topic's."""
     for text in (*reversed(re.sub(r"\[[^\]]*\]", "", path).split(".")), topic):
         said = [r for r, pattern in ROLES.items() if re.search(pattern, worded(text), re.I)]
         if said[:1] == ["voltage"] and "velocity" in said and not drives_by_name(text):
-            return ""  # the command of a speed
+            return ""  # a speed command
         if said:
             return said[0]
     return ""
 
 
 def of_a_place(paths: Sequence[str]) -> set[str]:
-    """Return the fields that are a robot's place: x and y beside the way that it faces."""
+    """Return the fields of a robot's pose: x and y together with a heading."""
     by_name: dict[tuple[str, str], str] = {}
     for path in paths:
         whole, dot, name = path.rpartition(".")
@@ -99,13 +100,13 @@ def of_a_place(paths: Sequence[str]) -> set[str]:
 
 
 def is_speed_command(name: str) -> bool:
-    """Return whether a type and a name tell the command of a speed, and no voltage."""
+    """Return whether type and name denote a speed command instead of a voltage."""
     speed = re.search(SPEED_COMMAND, worded(name), re.IGNORECASE) is not None
     return speed and not drives_by_name(name)
 
 
 def drives_by_name(text: str) -> bool:
-    """Return whether a name tells a voltage or a share of it, rather than any command."""
+    """Return whether a name denotes a voltage or duty cycle rather than any command."""
     return re.search(DRIVES, text, re.IGNORECASE) is not None
 
 
@@ -116,7 +117,7 @@ def hint_of(role: str, source: str) -> str:
 
 
 def wheel_of(source: str) -> str:
-    """Return the side of the robot that a name tells."""
+    """Return the side of the robot in a name."""
     words = re.split(r"[^a-z]+", worded(source).lower())
     return "_".join(side for side in _SIDES if side in words)
 
@@ -131,7 +132,7 @@ def motor_of(name: str) -> str:
 
 
 def is_barred(role: str, text: str) -> bool:
-    """Return whether a type, a topic or a name says that a field is none of its role."""
+    """Return whether a type, topic or name rules out a role."""
     if role in ("current", "direction"):
         return False
     if re.search(ELSEWHERE, text, re.IGNORECASE):

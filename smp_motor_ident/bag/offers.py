@@ -1,4 +1,5 @@
-"""What a recording offers: topics and the numbers in them."""
+# SPDX-License-Identifier: Apache-2.0
+"""List a recording's topics and their numeric fields."""
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
@@ -12,7 +13,7 @@ from smp_motor_ident.bag.types import Types
 from smp_motor_ident.errors import BagError
 from smp_motor_ident.finding import Finding
 
-_LISTED = 12  # elements of an array without names that are listed
+_MAX_LISTED = 12  # elements of an array without names that are listed
 
 
 @dataclass
@@ -27,8 +28,8 @@ class Offer:
     rate: float = 0.0  # [Hz], mean over the recording; 0 for less than two messages
     fields: list[str] = field(default_factory=list)  # paths of its numbers, as a mapping takes them
     remark: str = ""  # why its fields are unknown
-    table: bool = False  # whether it is of a file of columns
-    # What the file says of its columns' units
+    table: bool = False  # whether it comes from a file of columns
+    # Units of the columns, where the file names them
     units: Mapping[str, str] = field(default_factory=dict)
 
 
@@ -37,18 +38,18 @@ class Proposal:
     """A mapping that reads a recording."""
 
     suggestion: list[str] = field(default_factory=list)  # items for ``--map``
-    asked: list[str] = field(default_factory=list)  # what the user must add to them
-    remark: str = ""  # why there are none, or what the data could not confirm
+    asked: list[str] = field(default_factory=list)  # items that the user must add
+    remark: str = ""  # why there are no items, or which of them the data do not confirm
 
 
 @dataclass(kw_only=True)
 class Listing(Proposal):
-    """What a recording offers, and a mapping that was tried on it; none where none is needed."""
+    """Topics of a recording with a tested mapping; empty if it needs no mapping."""
 
     name: str  # of the recording
     offers: list[Offer]  # by topic
     needs_mapping: bool  # false where the recording holds our own messages
-    findings: list[Finding]  # what is missing or damaged
+    findings: list[Finding]  # missing or damaged parts
 
 
 def offers_of(recording: source.Recording, types: Types) -> list[Offer]:
@@ -107,7 +108,7 @@ def _fields(types: Types, batch: Any) -> tuple[list[str], str]:
             return list(chain.from_iterable(fields)), ""
     except BagError:
         return [], "unknown type: give its .msg files"
-    return [], f"not as its type says: {reason}"
+    return [], f"does not match its type: {reason}"
 
 
 def _paths(path: str, value: Any, parent: dict[str, Any]) -> Iterator[str]:
@@ -120,7 +121,7 @@ def _paths(path: str, value: Any, parent: dict[str, Any]) -> Iterator[str]:
         isinstance(value, list) and value and isinstance(value[0], dict)
     ):
         count = (value.count or 0) if isinstance(value, template.Number) else len(value)
-        keys: list[Any] = list(range(min(count, _LISTED)))
+        keys: list[Any] = list(range(min(count, _MAX_LISTED)))
         for texts in template.names_beside(parent).values():
             if len(texts) == count and len({text.value for text in texts}) == count:
                 keys = [text.value for text in texts]

@@ -1,7 +1,8 @@
-"""A mapping proposed by names, kept only where the signals behave as what they are called.
+# SPDX-License-Identifier: Apache-2.0
+"""Propose a mapping by names, and keep it only if the signals behave accordingly.
 
-What decides of units, such as the full scale of a PWM, is asked for and never guessed.  Where names
-do not tell the time, the voltage or the motion of a table, what the data show is proposed.
+Scales, such as the full scale of a PWM, are asked for and never guessed.  Where names do not
+identify the time, the voltage or the motion of a table, the data decide.
 """
 
 import re
@@ -18,15 +19,20 @@ from smp_motor_ident.bag import axis, checks, decode, drives, mapping, names, re
 from smp_motor_ident.bag.clock import runs
 from smp_motor_ident.bag.offers import Listing, Offer, Proposal, offers_of
 from smp_motor_ident.bag.source import Recording, recordings
-from smp_motor_ident.bag.tables import EPOCHS, TIME_NAMES, is_time_of_part, self_described
+from smp_motor_ident.bag.tables import (
+    MIN_TIMES_SINCE_1970,
+    TIME_NAMES,
+    is_time_of_part,
+    self_described,
+)
 from smp_motor_ident.bag.types import Types
 from smp_motor_ident.bag.units import needs, unit_of
 from smp_motor_ident.errors import BagError
 
-_RADIUS = "in metres: what is measured is the way of the rim"
-_MOST = 20_000  # samples that are looked at
-_SOUGHT = ("voltage", *names.MOTIONS)
-_WIDEST = 16  # columns that are tried where their names tell nothing
+_RADIUS = "in metres, because the recording has the speed of the rim"
+_MAX_SAMPLES = 20_000  # examined samples
+_ROLES = ("voltage", *names.MOTIONS)
+_MAX_UNNAMED_COLUMNS = 16  # columns tried if their names are not conclusive
 
 
 @dataclass
@@ -43,7 +49,7 @@ class _Candidate:
 
     @property
     def source(self) -> str:
-        """What a mapping calls it, in quotes where that would be read as something else."""
+        """Source as a mapping writes it, in quotes where it would be misread."""
         whole = self.offer.topic or self.path
         if self.offer.topic.startswith("/") and self.path != "value":
             whole = f"{self.offer.topic}.{self.path}"
@@ -56,7 +62,7 @@ class _Candidate:
 
     @property
     def unit(self) -> str:
-        """What follows the source: a unit by name, never a scale."""
+        """Unit that follows the source, by name; never a scale."""
         text = f"{self.offer.topic}.{self.path}"
         if unit := unit_of(self.role, self.offer.units.get(self.path, ""), text):
             return f":{unit}"
@@ -66,15 +72,15 @@ class _Candidate:
             steps = np.array_equal(whole, np.rint(whole)) and np.abs(whole).max() > 48
             volts = re.search(names.WORDS_OF_VOLTS, text, re.IGNORECASE)
             hint = ":pwm" if steps and not volts else ""
-        if self.role == "position" and not hint and _turn_of(whole) == 360:
+        if self.role == "position" and not hint and _find_wrap(whole) == 360:
             hint = ":deg"
         if hint == ":duty" and np.abs(whole).max(initial=0.0) > 1:
-            hint = ":pwm"  # of a scale that is asked for
+            hint = ":pwm"  # the user must give its scale
         return hint
 
 
 def list_topics(paths: Any, msg_files: Iterable[str] = ()) -> list[Listing]:
-    """List what recordings offer, and suggest how to map it."""
+    """List the topics of recordings, and suggest mappings."""
     types = Types(msg_files)
     listings = []
     for recording in recordings(paths):
@@ -84,7 +90,7 @@ def list_topics(paths: Any, msg_files: Iterable[str] = ()) -> list[Listing]:
             proposal = propose(recording, offers, types) if needed else Proposal()
             if proposal.suggestion:
                 try:
-                    read.read_recording(recording, _filled(proposal), types)
+                    read.read_recording(recording, _fill_placeholders(proposal), types)
                 except BagError as error:
                     text = f"a mapping was proposed by names and cannot be read: {error}"
                     recording.findings.append(storage.found("proposal_failed", text))
@@ -97,44 +103,44 @@ def list_topics(paths: Any, msg_files: Iterable[str] = ()) -> list[Listing]:
 
 
 def propose(recording: Recording, offers: list[Offer], types: Types) -> Proposal:
-    """Return what the file says itself, or a mapping by names that the data confirm if they can."""
-    if own := _of_the_file(recording):
+    """Return the file's own mapping, or one by names that the data confirm where they can."""
+    if own := _from_file(recording):
         return own
     apart = [[offer] for offer in offers] if any(o.table and o.count for o in offers) else [offers]
-    proposals = [_of_names_and_data(recording, group, types) for group in apart]
+    proposals = [_by_names_and_data(recording, group, types) for group in apart]
     return next((p for p in proposals if p.suggestion), proposals[0])
 
 
-def _of_names_and_data(recording: Recording, offers: list[Offer], types: Types) -> Proposal:
-    """Return what names and data tell of fields that belong together."""
+def _by_names_and_data(recording: Recording, offers: list[Offer], types: Types) -> Proposal:
+    """Return a mapping by names and data for each group of fields."""
     time = _time(offers)
     fields = list(_candidates(recording, offers, types, time))
     every = [c for c in fields if c.value.size]
     alone = recording.is_table and len(offers) == 1
     if alone and time is None:
-        time = _rising(every)
+        time = _find_unnamed_time(every)
     chosen, remarks = _by_names(every)
     if alone and not chosen and (pair := _by_data([c for c in every if c is not time])):
         chosen = [("", pair)]
         remarks = [f"by the data alone: {pair[1].source} follows {pair[0].source}; see to both"]
     if not chosen:
-        without = [c.source for c in fields if not c.value.size and c.role in _SOUGHT][:4]
+        without = [c.source for c in fields if not c.value.size and c.role in _ROLES][:4]
         remarks += [f"{one} holds no number" for one in without]
-        return Proposal(remark="; ".join([_reason(fields), *remarks]))
+        return Proposal(remark="; ".join([_explain_failure(fields), *remarks]))
     items = []
     for prefix, fields in chosen:
         items += [f"{prefix}{c.role}={c.source}{c.unit}" for c in fields]
     if time:
         items.append(f"time={time.source}{time.unit}")
-    asked = _asked([c for _, fields in chosen for c in fields], time, recording.is_table)
+    asked = _required_keys([c for _, fields in chosen for c in fields], time, recording.is_table)
     added = [f"{key}=… {why}" for key, why in asked.items()]
     return Proposal(suggestion=items, asked=added, remark="; ".join(remarks))
 
 
 def _by_names(every: Sequence[_Candidate]) -> tuple[list[tuple[str, list[_Candidate]]], list[str]]:
-    """Return by wheel what is called a voltage and a motion, and what no data could confirm."""
+    """Return voltages and motions by wheel according to their names, and unconfirmed ones."""
     wheels: dict[tuple[str, str], list[_Candidate]] = {}
-    for candidate in _of_motors(_of_robots(every)):
+    for candidate in _by_motor(_by_robot(every)):
         wheels.setdefault((candidate.robot, candidate.wheel), []).append(candidate)
     found_by_wheel, remarks = [], []
     for (robot, wheel), fields in sorted(wheels.items()):
@@ -145,23 +151,23 @@ def _by_names(every: Sequence[_Candidate]) -> tuple[list[tuple[str, list[_Candid
         sizes = [c for c in voltages if ways and c.value.size and c.value.min() >= 0]
         chosen = []
         try:
-            chosen = _explained([_directed(c, ways[0]) for c in sizes], motions)
-        except BagError as error:  # codes that are no signs
+            chosen = _select_voltage([_add_direction(c, ways[0]) for c in sizes], motions)
+        except BagError as error:  # direction codes without a sign
             remarks.append(str(error))
         used = ways if chosen else []
-        chosen = chosen or _explained(voltages, motions)
-        if not chosen and (chosen := _untestable(voltages, motions)):
-            remarks.append(_unconfirmed(chosen[0]))
+        chosen = chosen or _select_voltage(voltages, motions)
+        if not chosen and (chosen := _select_untestable(voltages, motions)):
+            remarks.append(_remark_on_unconfirmed(chosen[0]))
         if chosen:
             if _is_torque(chosen[0]):
-                remarks.append(_torque(chosen[0]))
+                remarks.append(_remark_on_torque(chosen[0]))
             current = [c for c in fields if c.role == "current"][:1]
             name = "_".join(filter(None, (robot, wheel)))
             found_by_wheel.append((f"{name}." if name else "", [*chosen, *used, *current]))
     return found_by_wheel, remarks
 
 
-def _of_robots(every: Sequence[_Candidate]) -> list[_Candidate]:
+def _by_robot(every: Sequence[_Candidate]) -> list[_Candidate]:
     """Return fields with the namespace that tells robots, or motors, apart: ``/robot1/pwm``."""
     spaces: dict[tuple[str, str], set[str]] = {}
     for c in every:
@@ -179,7 +185,7 @@ def _namespace(candidate: _Candidate) -> tuple[str, str]:
 
 
 def _may_drive(value: Array) -> bool:
-    """Return whether a field may be a voltage by its values alone: it is not 0, and no clock."""
+    """Return whether a field's values allow a voltage: not all 0, and not a clock."""
     return bool(value.any()) and drives.clock_of([value]) is None
 
 
@@ -187,20 +193,20 @@ def _is_torque(candidate: _Candidate) -> bool:
     return re.search(names.TORQUE, candidate.path, re.IGNORECASE) is not None
 
 
-def _torque(candidate: _Candidate) -> str:
-    """Return what is not known of an effort."""
+def _remark_on_torque(candidate: _Candidate) -> str:
+    """Return the remark on a field called effort."""
     return (
-        f"{candidate.source} is a torque [N m] by the documentation of its message, and moves as a "
-        "current does; take it only if your driver writes its command there"
+        f"{candidate.source} is a torque [N m] by its message's documentation; map it only if your "
+        "driver writes its command there"
     )
 
 
-def _of_motors(every: Sequence[_Candidate]) -> list[_Candidate]:
+def _by_motor(every: Sequence[_Candidate]) -> list[_Candidate]:
     """Return fields with the motor or the run that their names tell apart.
 
-    What a name ends in tells motors (``velL``), what a field is a part of runs (``run_2.u``).
+    A name's ending identifies the motor (``velL``), a field's parent the run (``run_2.u``).
     """
-    for tell in (names.motor_of, _whole_of):
+    for tell in (names.motor_of, _parent_of):
         named = [c if c.wheel else replace(c, wheel=tell(c.path)) for c in every]
         driven = {c.wheel for c in named if c.role == "voltage"}
         moved = {c.wheel for c in named if c.role in names.MOTIONS and c.wheel}
@@ -210,34 +216,34 @@ def _of_motors(every: Sequence[_Candidate]) -> list[_Candidate]:
     return list(every)
 
 
-def _whole_of(path: str) -> str:
+def _parent_of(path: str) -> str:
     whole, dot, _ = path.partition(".")
     return whole if dot and is_ros_name(whole) else ""
 
 
-def _directed(voltage: _Candidate, way: _Candidate) -> _Candidate:
-    """Return a voltage that is a size with its direction; BagError where that tells no sign."""
+def _add_direction(voltage: _Candidate, way: _Candidate) -> _Candidate:
+    """Return a magnitude of voltage with its direction; BagError if the codes have no sign."""
     size, direction = (axis.Series(c.time.astype(np.int64), c.value) for c in (voltage, way))
     return replace(voltage, value=checks.signed(size, direction, way.source).value)
 
 
-def _rising(every: list[_Candidate]) -> _Candidate | None:
-    """Return the column without a telling name that rises as a time does."""
+def _find_unnamed_time(every: list[_Candidate]) -> _Candidate | None:
+    """Return the unnamed column that rises like a time."""
     unnamed = [c for c in every if not c.role]
     k = drives.clock_of([c.value for c in unnamed])
     return None if k is None else replace(unnamed[k], role="time")
 
 
 def _by_data(every: list[_Candidate]) -> list[_Candidate]:
-    """Return a voltage and the motion that follows it best, where names do not tell both."""
+    """Return a voltage and the motion that follows it best, if names do not identify both."""
     size = max((c.value.size for c in every), default=0)
-    fields = [c for c in every if c.value.size == size][:_WIDEST]
+    fields = [c for c in every if c.value.size == size][:_MAX_UNNAMED_COLUMNS]
     unnamed = [c for c in fields if not c.role]
     voltages = [c for c in fields if c.role == "voltage"] or unnamed
     motions = [c for c in fields if c.role in names.MOTIONS] or unnamed
     best, pair = 0.0, []
     for u, y in product(voltages, motions) if unnamed else ():
-        drive, moved = u.value[:_MOST], y.value[:_MOST]
+        drive, moved = u.value[:_MAX_SAMPLES], y.value[:_MAX_SAMPLES]
         share, summed = (0.0, False) if u is y else drives.follows(drive, moved)
         steps = np.diff(moved, prepend=moved[:1]) if summed else moved
         if share > best and drives.unexplained(drive, steps) is not None:
@@ -247,8 +253,10 @@ def _by_data(every: list[_Candidate]) -> list[_Candidate]:
     return pair
 
 
-def _asked(chosen: list[_Candidate], time: _Candidate | None, table: bool) -> dict[str, str]:
-    """Return what the user must add to a mapping, and why."""
+def _required_keys(
+    chosen: list[_Candidate], time: _Candidate | None, table: bool
+) -> dict[str, str]:
+    """Return the keys that the user must add to a mapping, with reasons."""
     asked: dict[str, str] = {}
     units = [c.unit for c in chosen]
     if ":pwm" in units:
@@ -270,13 +278,15 @@ def _asked(chosen: list[_Candidate], time: _Candidate | None, table: bool) -> di
         asked |= {"sample_time": "in seconds, between rows: no column is a time"} if table else {}
     elif not time.unit and time.value.size > 1:
         step = float(np.nanmedian(np.diff(time.value)))
-        if step >= 1 and np.nanmax(time.value) < EPOCHS[-1][0]:  # of which the unit is found
+        if (
+            step >= 1 and np.nanmax(time.value) < MIN_TIMES_SINCE_1970[-1][0]
+        ):  # later times tell their unit
             asked["time"] = f"its unit, {time.source}:ms or :us (it rises by {step:g} a row)"
     return asked
 
 
-def _of_the_file(recording: Recording) -> Proposal | None:
-    """Return the mapping of a table that names its columns and units as the signals are."""
+def _from_file(recording: Recording) -> Proposal | None:
+    """Return the mapping of a table whose columns have the names and units of signals."""
     if not recording.is_table:
         return None
     try:
@@ -296,7 +306,7 @@ def _of_the_file(recording: Recording) -> Proposal | None:
     return Proposal(suggestion=list(dict.fromkeys(items)), asked=asked, remark=remark)
 
 
-def _untestable(voltages: list[_Candidate], motions: list[_Candidate]) -> list[_Candidate]:
+def _select_untestable(voltages: list[_Candidate], motions: list[_Candidate]) -> list[_Candidate]:
     """Return a voltage that changes less often than a test needs, and a motion, by their names."""
     seldom = [c for c in voltages if c.value.size and _changes(c) < drives.LAGS]
     moving = [
@@ -309,16 +319,16 @@ def _changes(voltage: _Candidate) -> int:
     return int(np.count_nonzero(np.diff(voltage.value)))
 
 
-def _unconfirmed(voltage: _Candidate) -> str:
-    """Return what the data could not tell of a voltage."""
+def _remark_on_unconfirmed(voltage: _Candidate) -> str:
+    """Return the remark on a voltage that the data cannot confirm."""
     times = _changes(voltage)
     how = f"changes {times} time{'s' * (times > 1)} only" if times else "is constant"
-    untold = "so that the data cannot confirm that it drives the motor"
-    return f"{voltage.source} {how}, {untold}; this is by the names alone"
+    untold = "so the data cannot confirm that it drives the motor"
+    return f"{voltage.source} {how}, {untold}; it was chosen by its name alone"
 
 
-def _reason(fields: list[_Candidate]) -> str:
-    """Return why nothing is proposed."""
+def _explain_failure(fields: list[_Candidate]) -> str:
+    """Return the reason for the missing proposal."""
     roles = {c.role for c in fields}
     missing = [] if "voltage" in roles else ["a voltage"]
     missing += [] if roles & set(names.MOTIONS) else ["a motion"]
@@ -327,8 +337,8 @@ def _reason(fields: list[_Candidate]) -> str:
     return "no field that is called a voltage explains one that is called a motion"
 
 
-def _filled(proposal: Proposal) -> mapping.SignalMap:
-    """Return the mapping of a proposal, with any value for what the user must add."""
+def _fill_placeholders(proposal: Proposal) -> mapping.SignalMap:
+    """Return the mapping of a proposal, with placeholders for the values the user must add."""
     unit = ":ms" if any(text.startswith("time=") for text in proposal.asked) else ""
     given = mapping.parse([i + unit if i.startswith("time=") else i for i in proposal.suggestion])
     hardware = {"supply_voltage": 12.0, "counts_per_revolution": 1.0}
@@ -350,7 +360,7 @@ def _time(offers: list[Offer]) -> _Candidate | None:
 def _candidates(
     recording: Recording, offers: list[Offer], types: Types, time: _Candidate | None
 ) -> Iterator[_Candidate]:
-    """Yield the fields whose names say what they may be, and the others of a table."""
+    """Yield the fields with a role by name, and the others of a table."""
     named: list[tuple[str, Offer, str]] = []
     for offer in offers:
         place = names.of_a_place(offer.fields)
@@ -382,38 +392,40 @@ def _candidates(
         kept = np.isfinite(value) & (True if there is None else there)
         wheel = names.wheel_of(f"{offer.topic}.{path}")
         if not (role == "voltage" and _is_supply(path, value[kept])):
-            role, times = _counted(role, value[kept]), at.astype(np.float64)[kept]
+            role, times = _check_count(role, value[kept]), at.astype(np.float64)[kept]
             yield _Candidate(role, wheel, "", offer, path, times, value[kept])
 
 
-def _turn_of(angle: Array) -> float:
-    """Return at what an angle starts again, a turn in radians or degrees; 0 where it does not."""
+def _find_wrap(angle: Array) -> float:
+    """Return the turn at which an angle wraps, in radians or degrees; 0 if it does not."""
     span, jump = np.ptp(angle) if angle.size else 0.0, np.abs(np.diff(angle)).max(initial=0.0)
     return next((turn for turn in (2 * np.pi, 360.0) if span <= turn and jump > turn / 2), 0.0)
 
 
-def _counted(role: str, value: Array) -> str:
-    """Return the role of a field that its name may call a count: only whole numbers are one."""
+def _check_count(role: str, value: Array) -> str:
+    """Return the role of a possible count: only whole numbers are counts."""
     return "position" if role == "count" and not np.array_equal(value, np.rint(value)) else role
 
 
 def _is_supply(name: str, value: Array) -> bool:
-    """Return whether a voltage may be the supply's by its name, and never falls to half of it."""
+    """Return whether a voltage is a supply by its name and never falls to half its maximum."""
     size = np.abs(value)
     named = re.search(names.MAY_BE_SUPPLY, names.worded(name), re.IGNORECASE)
     return bool(named and size.size and 0 < size.max() < 2 * size.min())
 
 
-def _explained(voltages: list[_Candidate], motions: list[_Candidate]) -> list[_Candidate]:
-    """Return the voltage that explains a motion best, and the motions that it explains as well.
+def _select_voltage(voltages: list[_Candidate], motions: list[_Candidate]) -> list[_Candidate]:
+    """Return the voltage that explains a motion best, and all motions that it explains.
 
-    Where chance may be what tells two apart, one in volts goes before a share of the supply.  A
-    command that is not called one of a drive must leave half as much, a torque a quarter.
+    Of two similar fits, a voltage in volts precedes a duty cycle.  A command without the name of a
+    drive must leave half of the residual, a torque a quarter.
     """
     best: list[_Candidate] = []
     least = np.inf
     for voltage in sorted(voltages, key=lambda c: needs("voltage", c.unit[1:], "supply_voltage")):
-        explained = [(c, rest) for c in motions if (rest := _rest(voltage, c)) is not None]
+        explained = [
+            (c, rest) for c in motions if (rest := _unexplained_share(voltage, c)) is not None
+        ]
         if not explained:
             continue
         rest = min(rest for _, rest in explained)
@@ -425,9 +437,9 @@ def _explained(voltages: list[_Candidate], motions: list[_Candidate]) -> list[_C
     return best
 
 
-def _rest(voltage: _Candidate, motion: _Candidate) -> float | None:
+def _unexplained_share(voltage: _Candidate, motion: _Candidate) -> float | None:
     """Return the share of the motion that a voltage leaves unexplained; None where it does not."""
-    order = np.argsort(motion.time, kind="stable")[:_MOST]
+    order = np.argsort(motion.time, kind="stable")[:_MAX_SAMPLES]
     y = motion.value[order]
     if voltage.time.size < 2:
         return None
@@ -435,7 +447,7 @@ def _rest(voltage: _Candidate, motion: _Candidate) -> float | None:
     index = np.searchsorted(voltage.time[ranked], motion.time[order], "right") - 1
     u = voltage.value[ranked][np.maximum(index, 0)]
     if motion.role != "velocity":
-        turn = _turn_of(y) if motion.role == "position" else 0.0
+        turn = _find_wrap(y) if motion.role == "position" else 0.0
         steps = np.diff(np.unwrap(y, period=turn) if turn else y, prepend=y[:1])
         if drives.late(u, y) > drives.late(u, steps):  # counts of an interval are a speed
             return None

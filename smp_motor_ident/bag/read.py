@@ -1,4 +1,5 @@
-"""From paths and a mapping to records: the whole way."""
+# SPDX-License-Identifier: Apache-2.0
+"""Read records from paths and a mapping."""
 
 import math
 import struct
@@ -32,7 +33,7 @@ BETWEEN = 1.0  # time [s] that a joined record leaves between two recordings
 def read_experiments(paths: Any, mapping: Any = None) -> dict[str, list[Record]]:
     """Read recordings as `read_records` does, each as records of its own, in their order.
 
-    Of a folder with several recordings those that cannot be read become findings of the others.
+    Unreadable recordings in a folder become findings of the others.
     """
     asked = mappings.of(mapping)
     types = Types(asked.msg_files)
@@ -87,7 +88,7 @@ def read_records(paths: Any, mapping: Any = None) -> dict[str, Record]:
 
 
 def join_records(records: list[Record]) -> Record:
-    """Join recordings of one motor; each begins a new segment, one second behind the last."""
+    """Join recordings of one motor; each begins a new segment, one second after the last."""
     if len(records) == 1:
         return records[0]
     first = records[0]
@@ -132,14 +133,14 @@ def read_recording(recording: Recording, asked: SignalMap, types: Types) -> list
 
 @contextmanager
 def one_line(recording: Recording) -> Iterator[None]:
-    """Make one message of any error, which tells also what was found amiss before."""
+    """Turn any error into a one-line `BagError` that includes earlier findings."""
     try:
-        with np.errstate(all="ignore"):  # spoilt numbers may be of any size
+        with np.errstate(all="ignore"):  # damaged numbers may have any size
             yield
     except BagError as error:
         amiss = [f.message for f in recording.findings if f.message not in str(error)]
         raise BagError("; ".join([str(error), *amiss])) from None
-    except _SPOILT as error:
+    except _DAMAGE as error:
         reason = (str(error).splitlines() or [""])[0][:200]
         raise BagError(
             f"{recording.files[0]}: is damaged in a way that cannot be read "
@@ -147,11 +148,11 @@ def one_line(recording: Recording) -> Iterator[None]:
         ) from None
 
 
-_SPOILT = (
+_DAMAGE = (
     ArithmeticError, AttributeError, LookupError, MemoryError, OSError, RecursionError,
     TypeError, ValueError, struct.error,
 )  # fmt: skip
-"""What spoilt bytes lead readers to: the message names the file, not the code."""
+"""Errors that damaged bytes cause in readers; the message names the file, not the code."""
 
 
 def _records(recording: Recording, asked: SignalMap, types: Types) -> list[Record]:
@@ -177,7 +178,7 @@ def _records(recording: Recording, asked: SignalMap, types: Types) -> list[Recor
             for name, mine in apart(recording, wheel, plan, tables):
                 mine = timed(recording, plan, mine) if recording.is_table else mine
                 record = assemble(name, plan, hardware_of(plan.hardware), mine, recording.name)
-                doubts = _doubts(plan, channels)
+                doubts = _question_voltage(plan, channels)
                 records.append(replace(record, findings=(*findings, *doubts, *record.findings)))
         except BagError as error:
             if not plan.own:
@@ -226,7 +227,7 @@ def _plans(recording: Recording, asked: SignalMap, channels: list[Channel]) -> d
     for topic, wheel in names.items():
         if not is_ros_name(wheel):
             raise BagError(
-                f"{recording.name}: {topic!r} is no ROS name, so that its wheel has none"
+                f"{recording.name}: {topic!r} is not a ROS name, so its wheel has no name"
             )
         signals = {name: Signal(topic, path) for name, path in OWN_FIELDS.items()}
         given = asked.motors.get(wheel, asked.defaults)
@@ -240,8 +241,8 @@ def _plans(recording: Recording, asked: SignalMap, channels: list[Channel]) -> d
     return plans
 
 
-def _doubts(plan: MotorMap, channels: list[Channel]) -> list[Finding]:
-    """Return what a field's name says against its being a voltage."""
+def _question_voltage(plan: MotorMap, channels: list[Channel]) -> list[Finding]:
+    """Return findings on a mapped voltage whose name contradicts it."""
     voltage = plan.signals["voltage"]
     name = f"{voltage.topic}.{voltage.field}" if voltage.topic else voltage.field
     kind = next((c.type for c in channels if c.topic == voltage.topic), "")
@@ -249,8 +250,8 @@ def _doubts(plan: MotorMap, channels: list[Channel]) -> list[Finding]:
         return []
     scaled = bool(voltage.unit) or (voltage.scale, voltage.offset) != (1.0, 0.0)
     text = (
-        f"voltage: {name} is by its name the command of a speed: where a loop controls the speed, "
-        "the numbers are those of the loop and not of a motor; map the PWM or the voltage"
+        f"voltage: {name} is a speed command by its name; if a loop controls the speed, the "
+        "estimates describe the loop, not the motor. Map the PWM or the voltage"
     )
     return [found("speed_command", text, "warning" if scaled else "unreliable")]
 
@@ -258,7 +259,7 @@ def _doubts(plan: MotorMap, channels: list[Channel]) -> list[Finding]:
 def _description(
     wheel: str, plan: MotorMap, topics: list[str], tables: Mapping[str, Table]
 ) -> tuple[dict[str, float], list[Finding]]:
-    """Return the last description of a wheel, and what was found about it."""
+    """Return the last description of a wheel, and findings on it."""
     spaces = {topic.rpartition("/")[0] for topic in plan.topics}
     mine = [topic for topic in topics if topic.rpartition("/")[0] in spaces]
     for topic in mine:
@@ -272,19 +273,19 @@ def _description(
         own = any(signal.field == "encoder_count" for signal in plan.signals.values())
         text = (
             f"{wheel}: {'no motor_description' if own else 'no gear_ratio'}; a gear ratio of 1 "
-            "is assumed, so that its parameters are those of the shaft that was measured"
+            "is assumed, so the parameters refer to the measured shaft"
         )
         return {}, [found("gear_ratio_assumed", text)]
     return {}, []
 
 
 def described(message: Any) -> Hardware:
-    """Return what a ``motor_description`` tells of the hardware."""
+    """Return the hardware of a ``motor_description``."""
     return hardware_of({name: float(getattr(message, name)) for name in mappings.DESCRIBED})
 
 
 def hardware_of(known: Mapping[str, float]) -> Hardware:
-    """Return what is known of the hardware; what no hardware can have is not known."""
+    """Return the known hardware; impossible values count as unknown."""
     sound: dict[str, Any] = {
         n: v for n, v in known.items() if math.isfinite(v) and (v > 0 or n in mappings.ACCURACIES)
     }

@@ -1,4 +1,5 @@
-"""A bag's messages one by one in the order in which they came: what a player needs."""
+# SPDX-License-Identifier: Apache-2.0
+"""Yield a bag's messages one by one in order of arrival, for a player."""
 
 import heapq
 from collections.abc import Callable, Iterator
@@ -32,7 +33,7 @@ class Replay:
 
     @property
     def findings(self) -> list[Finding]:
-        """What was found missing or damaged while reading."""
+        """Findings on missing or damaged parts."""
         return self._recording.findings
 
     def messages(

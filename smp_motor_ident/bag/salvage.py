@@ -1,7 +1,8 @@
-"""Messages out of the pages of a SQLite file whose tree is broken.
+# SPDX-License-Identifier: Apache-2.0
+"""Recover messages from the pages of a SQLite file with a damaged tree.
 
-A tree that was cut off cannot be walked from its root, since a page near the root may be among
-the lost ones; yet every leaf page holds whole rows by itself.  The layout of pages, cells and
+A truncated tree cannot be read from its root, since a page near the root may be lost; but every
+leaf page holds whole rows.  The layout of pages, cells and
 records is that of https://www.sqlite.org/fileformat2.html, sections 1.6 and 2.1.
 """
 

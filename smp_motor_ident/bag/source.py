@@ -1,4 +1,5 @@
-"""From paths to recordings: folders, split bags, bare files, tables alone and together."""
+# SPDX-License-Identifier: Apache-2.0
+"""Find recordings in paths: folders, split bags, bare files, tables alone and together."""
 
 import os
 import re
@@ -13,7 +14,7 @@ import msgspec
 import yaml
 
 from smp_motor_control.errors import printable
-from smp_motor_control.parameter_file import bounded_yaml
+from smp_motor_control.parameter_file import load_bounded_yaml
 from smp_motor_ident.bag.readers import BAGS, PACKED, TABLES, is_table, open_source
 from smp_motor_ident.bag.readers.format import Messages, Tables, check_width
 from smp_motor_ident.bag.storage import TABLE, Batch, Channel, Table, damaged, found
@@ -26,8 +27,8 @@ _BAG_NAME = re.compile(rf"({'|'.join(map(re.escape, BAGS))})(\.\w+)?$")
 _NAMED_ONLY = (".json", ".txt", ".log", ".dat")
 """Tables that a folder may hold for other reasons: read only when named."""
 _LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
-_MOST_BYTES = 1 << 24
-"""Of a metadata.yaml that are read; one with a thousand topics has some 500 kB."""
+_MAX_METADATA_BYTES = 1 << 24
+"""Largest read part of a metadata.yaml; one with a thousand topics has some 500 kB."""
 
 
 class _Topic(msgspec.Struct):
@@ -43,7 +44,7 @@ class _Counted(msgspec.Struct):
 
 
 class _Information(msgspec.Struct):
-    """What of a metadata.yaml is used, in every version of it."""
+    """Used entries of a metadata.yaml, in all versions."""
 
     relative_file_paths: list[str]
     topics_with_message_count: list[_Counted] | None = None
@@ -60,9 +61,9 @@ class Recording:
     name: str  # what to call it in messages and results
     files: list[Path]  # in the order in which they were written
     declared: dict[str, int] | None = None  # messages by topic as metadata.yaml counts them
-    # What was found amiss, grows while the files are read
+    # Grows while the files are read
     findings: list[Finding] = field(default_factory=list)
-    # Whether it was found in a folder with others, so that nobody asked for it by name
+    # Whether it was found in a folder with others, rather than named by the user
     one_of_many: bool = False
     _sources: dict[Path, Messages | Tables | None] = field(default_factory=dict, repr=False)
 
@@ -95,7 +96,7 @@ class Recording:
         return every
 
     def _topic(self, path: Path, channel: Channel) -> str:
-        """Return a channel's topic: of one table among several it begins with the file's name."""
+        """Return a channel's topic, which begins with the file's name for one of several tables."""
         if channel.encoding != TABLE or len(self.files) == 1:
             return channel.topic
         return f"/{path.stem}" + (f"/{channel.topic}" if channel.topic else "")
@@ -110,7 +111,7 @@ class Recording:
         raise BagError(f"{self.name}: has no {topic or 'table'}")
 
     def batches(self, wanted: Callable[[Channel], bool]) -> Iterator[list[Batch]]:
-        """Read all files, and note every message that is missing."""
+        """Read all files, and report every missing message."""
         counts: Counter[str] = Counter()
         seen: set[str] = set()
         for path in self.files:
@@ -143,7 +144,7 @@ class Recording:
         self._note(found("messages_lost", text, "warning", read=have, counted=declared))
 
     def _source(self, path: Path) -> Messages | Tables | None:
-        """Open a file; where others remain, one that cannot be read becomes a finding."""
+        """Open a file; an unreadable one among several becomes a finding."""
         if path not in self._sources:
             try:
                 source = open_source(path, self._folder, self.budget)
@@ -170,7 +171,7 @@ def recordings(paths: Any, topics: Collection[str] = ()) -> list[Recording]:
         if not path.exists():
             raise BagError(f"{path}: does not exist")
         if not (path.is_dir() or path.is_file()):
-            raise BagError(f"{path}: is a pipe or a device; save what it gives as a file")
+            raise BagError(f"{path}: is a pipe or a device; save its output as a file")
         try:
             inside = _of_folder(path) if path.is_dir() else [Recording(path.name, [path])]
         except OSError as error:
@@ -182,11 +183,11 @@ def recordings(paths: Any, topics: Collection[str] = ()) -> list[Recording]:
         every += inside
     if not every:
         raise BagError("no bag is given")
-    return _of_columns(_joined(every, topics), topics)
+    return _join_by_columns(_join_topics(every, topics), topics)
 
 
-def _of_columns(every: list[Recording], columns: Collection[str]) -> list[Recording]:
-    """Put together tables each of which has some of the columns that a mapping names."""
+def _join_by_columns(every: list[Recording], columns: Collection[str]) -> list[Recording]:
+    """Join tables that each have some of the mapped columns."""
     if len(every) < 2 or not columns or any(not r.is_table or r.one_of_many for r in every):
         return every
     held = [{name for c in one.channels() for name in c.fields} & set(columns) for one in every]
@@ -197,8 +198,8 @@ def _of_columns(every: list[Recording], columns: Collection[str]) -> list[Record
     return [Recording("+".join(stems), [one.files[0] for one in every])]
 
 
-def _joined(every: list[Recording], topics: Collection[str]) -> list[Recording]:
-    """Put together the tables that a mapping names as topics; others are then not asked for."""
+def _join_topics(every: list[Recording], topics: Collection[str]) -> list[Recording]:
+    """Join the tables that a mapping names as topics; leave out the others."""
     begins = {r.files[0]: f"/{r.files[0].stem}" for r in every if len(r.files) == 1}
     named = {f for f, name in begins.items() if any(f"{t}.".startswith(f"{name}.") for t in topics)}
     parts = [r for r in every if r.files[0] in named]
@@ -212,7 +213,7 @@ def _joined(every: list[Recording], topics: Collection[str]) -> list[Recording]:
 
 
 def _of_folder(top: Path) -> list[Recording]:
-    """Return the recordings of a folder: one bag, or what lies in it; a link back is none."""
+    """Return the recordings of a folder: one bag, or its contents; skip links to parents."""
     every: list[Recording] = []
     waiting, seen = [top], set[tuple[int, int]]()
     while waiting:
@@ -250,7 +251,7 @@ def _of_files(name: str, here: Sequence[Path]) -> list[Recording]:
 
 
 def _storages(files: Iterable[Path]) -> list[Path]:
-    """Return the bag files; not a plain one beside its own compressed form, or the reverse."""
+    """Return the bag files, each once where it is there both plain and compressed."""
     storages = [p for p in files if _BAG_NAME.search(p.name) and p.suffix in (*BAGS, *PACKED)]
     plain = {p.name for p in storages if p.suffix in BAGS}
     return [p for p in storages if p.name in plain or p.name.removesuffix(p.suffix) not in plain]
@@ -267,13 +268,13 @@ def _order(path: Path) -> tuple[str, int]:
 
 
 def _bag(path: Path) -> Recording:
-    """Return a bag by its metadata.yaml, of any version, as far as it can be trusted."""
+    """Return a bag by its metadata.yaml, of any version, ignoring invalid entries."""
     name = _name(path)
     bag = Recording(name, [])
     try:
         with (path / "metadata.yaml").open("rb") as metadata:
-            text = metadata.read(_MOST_BYTES).decode("utf-8", "replace")
-        given = msgspec.convert(bounded_yaml(text, _LOADER), _Metadata)
+            text = metadata.read(_MAX_METADATA_BYTES).decode("utf-8", "replace")
+        given = msgspec.convert(load_bounded_yaml(text, _LOADER), _Metadata)
         information = given.rosbag2_bagfile_information
         listed = [Path(file).name for file in information.relative_file_paths]
         bag.declared = _declared(information)

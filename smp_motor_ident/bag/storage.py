@@ -1,4 +1,5 @@
-"""What recordings consist of: channels, and batches of raw messages or tables of columns."""
+# SPDX-License-Identifier: Apache-2.0
+"""Contents of recordings: channels, and batches of raw messages or tables of columns."""
 
 import re
 from collections.abc import Mapping
@@ -17,12 +18,12 @@ TABLE = "table"  # encoding of a channel whose file holds columns of numbers ins
 
 
 def found(code: str, message: str, severity: Severity = "note", **evidence: float) -> Finding:
-    """Return what was found while reading."""
+    """Return a finding made while reading."""
     return Finding(code, severity, message, evidence)
 
 
 def damaged(message: str) -> Finding:
-    """Return that part of a recording is lost."""
+    """Return a finding on a lost part of a recording."""
     return Finding("damaged_recording", "warning", message)
 
 
@@ -40,11 +41,11 @@ class Channel:
     # Whether the messages' sequence is the publisher's own count, so that a gap is a loss
     numbered: bool = False
     fields: tuple[str, ...] = ()  # names of the columns of a table
-    # What the file says of its columns' units
+    # Units of the columns, where the file names them
     units: Mapping[str, str] = field(default_factory=dict, hash=False)
-    # Words of a column that tells motors apart, in the order of the numbers that stand for them
+    # Words of a column that names motors, by the numbers that replace them
     words: Mapping[str, tuple[str, ...]] = field(default_factory=dict, hash=False)
-    # Of the wheel [m] whose rotation the file tells in units of length; 0 where it does not
+    # Radius [m] of the wheel for motions in units of length; 0 if unknown
     wheel_radius: float = 0.0
     lengths: tuple[int, ...] = ()  # how many values each column has, where they differ
 
@@ -93,20 +94,20 @@ class Table:
     present: dict[str, Flags] = field(default_factory=dict)
     # shape (n,): the publisher's own count, where the recorder kept it for every message
     number: Integers | None = None
-    findings: list[Finding] = field(default_factory=list)  # what was found amiss
+    findings: list[Finding] = field(default_factory=list)
     clocked: bool = False  # whether ``log`` is the file's own time of each sample
     # Columns of whole nanoseconds, whatever unit is mapped: they were written as dates
     exact: frozenset[str] = frozenset()
 
     @property
     def logged(self) -> Integers:
-        """When the recorder got them, once that is known."""
+        """Log times, once known."""
         assert self.log is not None
         return self.log
 
     @property
     def seconds(self) -> Array:
-        """Their stamps where they have such, else when they were recorded, since 1970 [s]."""
+        """Stamps if there are any, else log times, since 1970 [s]."""
         return 1e-9 * (self.logged if self.stamp is None else self.stamp).astype(np.float64)
 
 
@@ -121,7 +122,7 @@ def gather(data: Bytes, at: Integers, dtype: str) -> NDArray[Any]:
 
 
 def first_line(error: BaseException) -> str:
-    """Return an error's first line, or its kind where it says nothing."""
+    """Return an error's first line, or its type if it has no text."""
     return (str(error).splitlines() or [type(error).__name__])[0]
 
 

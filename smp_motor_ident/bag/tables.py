@@ -1,4 +1,5 @@
-"""Files of columns as recordings: which column is which signal, and which is the time."""
+# SPDX-License-Identifier: Apache-2.0
+"""Assign the columns of files to signals and time."""
 
 import re
 from collections.abc import Mapping
@@ -23,13 +24,13 @@ TIME_NAMES = (
     r"|temps|tiempo|tempo|(?:^|\W|_)tid(?:$|\W|_)|czas|čas|zaman|aika|(?:^|\W|_)(?:timp|idő|tijd)"
     r"|время|时间|時間|시간"
 )
-"""What a column of time is called, in the languages of those who log motors."""
+"""Names of a time column in several languages."""
 
-EPOCHS = ((1e17, "ns"), (1e14, "us"), (1e11, "ms"))
-"""A number of time beyond each is of today in that unit since 1970."""
+MIN_TIMES_SINCE_1970 = ((1e17, "ns"), (1e14, "us"), (1e11, "ms"))
+"""Smallest times since 1970, by unit."""
 
-ROUNDED = 0.01
-"""A radius that is given as the file's within so much is that of the file, which is not rounded."""
+RADIUS_TOLERANCE = 0.01
+"""Relative tolerance within which a given radius is replaced by the file's exact one."""
 
 _WHEELS = ((DEFAULT_MOTOR, ""), ("left", "left_"), ("right", "right_"))
 
@@ -97,7 +98,7 @@ def self_described(recording: Recording, asked: SignalMap) -> dict[str, MotorMap
             signals = {name: Signal(channel.topic, column) for name, column in named.items()}
             signals["time"] = Signal(channel.topic, "time")
             given = asked.motors.get(wheel, asked.defaults)
-            if abs(given.wheel_radius / (channel.wheel_radius or np.inf) - 1) < ROUNDED:
+            if abs(given.wheel_radius / (channel.wheel_radius or np.inf) - 1) < RADIUS_TOLERANCE:
                 given = replace(given, wheel_radius=channel.wheel_radius)
             plans[wheel] = resolved(replace(given, signals=signals), channels)
     if plans:
@@ -111,10 +112,10 @@ def self_described(recording: Recording, asked: SignalMap) -> dict[str, MotorMap
 def add_time_columns(
     recording: Recording, plans: Mapping[str, MotorMap], wanted: dict[str, list[str]]
 ) -> None:
-    """Ask for every wanted table's column of time, and those that tell motors apart."""
+    """Add the columns of time, and those that name motors, to the requested ones."""
     for plan in plans.values():
         for topic in plan.topics:
-            wanted[topic] += [n for n in _telling(recording, topic) if n not in wanted[topic]]
+            wanted[topic] += [n for n in _motor_columns(recording, topic) if n not in wanted[topic]]
             signal = _time_signal(recording, plan, topic)
             if signal is not None and signal.field not in wanted[signal.topic]:
                 wanted[signal.topic].append(signal.field)
@@ -148,13 +149,13 @@ def _time_signal(recording: Recording, plan: MotorMap, topic: str) -> Signal | N
 def apart(
     recording: Recording, wheel: str, plan: MotorMap, tables: Mapping[str, Table]
 ) -> list[tuple[str, Mapping[str, Table]]]:
-    """Return the tables of each motor that a column tells apart, by the motor's name.
+    """Return the tables of each motor named in a column, by the motor's name.
 
-    Bags, and tables without such a column or with rows of one motor alone, are ``wheel``'s.
+    Bags, and tables without such a column or with rows of only one motor, belong to ``wheel``.
     """
     signals = [(signal.topic, signal.field) for signal in plan.signals.values()]
     for topic in plan.topics if recording.is_table and len(plan.topics) == 1 else ():
-        for column, labels in _telling(recording, topic).items():
+        for column, labels in _motor_columns(recording, topic).items():
             if (topic, column) in signals:
                 continue
             of = tables[topic].columns[column]
@@ -176,8 +177,8 @@ def apart(
     return [(wheel, tables)]
 
 
-def _telling(recording: Recording, topic: str) -> dict[str, tuple[str, ...]]:
-    """Return the columns of a table that tell motors apart, with the words for their numbers."""
+def _motor_columns(recording: Recording, topic: str) -> dict[str, tuple[str, ...]]:
+    """Return the columns of a table that name motors, with the words for their numbers."""
     channel = next(c for c in recording.channels() if c.topic == topic)
     words = {name: channel.words.get(name, ()) for name in channel.fields}
     return {name: own for name, own in words.items() if tells_motors(name, own)}
@@ -236,23 +237,23 @@ def timed(recording: Recording, plan: MotorMap, tables: Mapping[str, Table]) -> 
 
 
 def _check_seconds(log: Integers, signal: Signal, recording: Recording) -> None:
-    """Refuse a time without a unit that cannot be in seconds: no motor shows in such rows."""
+    """Refuse a time without unit whose rows are too far apart for seconds."""
     steps = np.diff(log[log > clock.NEVER]) * 1e-9
     step = float(np.median(steps)) if steps.size else 0.0
     if step >= limits.SECONDS_APART.value:
         raise BagError(
-            f"{recording.files[0]}: {signal.field} rises by {step:g} a row, which are no seconds; "
+            f"{recording.files[0]}: {signal.field} rises by {step:g} per row, too fast; "
             f"tell its unit: time={signal.field}:ms (or us, ns; s where it is seconds)"
         )
 
 
 def _nanoseconds(table: Table, signal: Signal) -> tuple[Integers, str]:
-    """Return the times of a table, `NEVER` where there is none; and a unit that was inferred."""
+    """Return the times of a table, `NEVER` for missing cells, and an inferred unit."""
     column = table.columns[signal.field]
     if signal.field in table.exact:
         return column.astype(np.int64), ""
     unit = signal.unit
     if not unit:
         size = np.nanmedian(np.abs(column.astype(np.float64))) if column.size else 0.0
-        unit = next((name for least, name in EPOCHS if size > least), "")
+        unit = next((name for least, name in MIN_TIMES_SINCE_1970 if size > least), "")
     return clock.nanoseconds(column, signal, unit), unit

@@ -1,7 +1,8 @@
-"""One message taken apart: where its numbers, strings and lengths stand.
+# SPDX-License-Identifier: Apache-2.0
+"""Parse one message into the positions of its numbers, strings and lengths.
 
-CDR puts a field behind everything that precedes it, aligned to its size from the byte
-after the four of the encapsulation.  ROS 1 puts it there unaligned, and has no such four bytes.
+CDR aligns every field to its size, counted from the end of the four bytes of encapsulation.  ROS 1
+neither aligns fields nor has these bytes.
 """
 
 import re
@@ -18,7 +19,7 @@ from smp_motor_ident.errors import BagError
 _NUMPYS = ("float32", "float64", *(f"{u}int{bits}" for u in ("", "u") for bits in (8, 16, 32, 64)))
 _KINDS = {name: np.dtype(name).str[1:] for name in _NUMPYS}
 _KINDS |= dict.fromkeys(("bool", "byte", "char", "octet"), "u1")
-_MOST_ELEMENTS = 100_000  # messages inside one; all that have bytes of their own need some
+_MOST_ELEMENTS = 100_000  # messages inside one
 _STEP = re.compile(r"(\w+)((?:\[[^\]]*\])*)")
 
 
@@ -37,7 +38,7 @@ class Number:
 
 @dataclass(frozen=True)
 class Text:
-    """A string and the bytes where it stands."""
+    """A string and its position."""
 
     value: str
     begin: int
@@ -46,7 +47,7 @@ class Text:
 
 @dataclass
 class Template:
-    """One message taken apart: positions instead of values, those of all lengths among them."""
+    """Positions of the values and lengths of one message."""
 
     root: dict[str, Any]
     lengths: list[int] = field(default_factory=list)
@@ -75,7 +76,7 @@ def parse_path(path: str) -> list[str | int]:
 
 
 class _Parser:
-    """Takes one message apart."""
+    """Parser of one message."""
 
     def __init__(self, data: bytes, definitions: Definitions, ros1: bool) -> None:
         if not ros1 and (len(data) < 4 or data[0] != 0 or data[1] > 1):
@@ -118,7 +119,7 @@ class _Parser:
         return [self.value(element) for _ in range(count)]
 
     def take(self, size: int, alignment: int) -> int:
-        """Return where the next bytes begin, and go behind them."""
+        """Return the position of the next bytes, and skip them."""
         begin = self._aligned(alignment)
         if begin + size > len(self.data):
             raise DecodeError(f"it ends at byte {len(self.data)}, inside a field")
@@ -154,7 +155,7 @@ class _Parser:
 
 
 def take_apart(data: bytes, name: str, definitions: Definitions, encoding: str) -> Template:
-    """Return where everything in a message stands; the encoding is ``cdr`` or ``ros1``."""
+    """Return the positions in a message; the encoding is ``cdr`` or ``ros1``."""
     try:
         return _Parser(data, definitions, encoding == "ros1").parse(name)
     except RecursionError:
@@ -189,7 +190,7 @@ def locate(template: Template, path: Sequence[str | int]) -> tuple[Number | None
         if here is None:
             return None, names
     if not isinstance(here, Number):
-        raise BagError("is no number")
+        raise BagError("is not a number")
     if here.count is not None:
         raise BagError("is an array; say which element, such as [0] or [name]")
     return here, names
@@ -200,14 +201,14 @@ def _element(here: Any, index: int) -> Any:
     if isinstance(here, list):
         return here[index] if index < len(here) else None
     if not isinstance(here, Number) or here.count is None:
-        raise BagError("is no array where an index is given")
+        raise BagError("is not an array, but an index is given")
     if index >= here.count:
         return None
     return Number(here.offset + index * np.dtype(here.kind).itemsize, here.kind)
 
 
 def _index_of(name: str, parent: Mapping[str, Any], here: Any, used: list[Text]) -> int | None:
-    """Return the index of a name in the strings beside an array, or inside its elements."""
+    """Return the index of a name among the names next to an array, or in its elements."""
     beside = names_beside(parent)
     for texts in beside.values():
         if name in (values := [text.value for text in texts]):
@@ -221,6 +222,6 @@ def _index_of(name: str, parent: Mapping[str, Any], here: Any, used: list[Text])
                 return k
         return None
     if not beside and not any(isinstance(v, list) for v in parent.values()):
-        raise BagError(f"has no names beside it, so that [{name}] says nothing; use [0]")
+        raise BagError(f"has no list of names, so [{name}] is undefined; use an index such as [0]")
     used.extend(text for texts in beside.values() for text in texts)
     return None

@@ -1,9 +1,9 @@
-"""How long a loop takes to answer: from the stamp of a sample to the voltage that answers it.
+# SPDX-License-Identifier: Apache-2.0
+"""Measure the delay of a loop from the stamp of a sample to the voltage in response.
 
-Commands of ``wheel_pid`` carry the stamp of the sample that they answer, so a bag that was
-recorded while it drove tells for every command when it arrived.  Where the hardware reports the
-voltage that it applied, the delay that explains it best tells whether the driver applies a
-command on arrival or keeps it until its next sample.
+Commands of ``wheel_pid`` carry the stamp of their sample, so a bag recorded while driving gives the
+arrival time of every command.  If the hardware reports the applied voltage, the delay that explains
+it best shows whether the driver applies a command on arrival or at its next sample.
 """
 
 import math
@@ -19,18 +19,18 @@ from smp_motor_ident.errors import BagError
 
 COMMAND = "smp_interfaces/msg/MotorCommand"
 
-LEAST_ANSWERS = 50  # commands below which quantiles of their delay mean nothing
+MIN_COMMANDS = 50  # smallest number of commands for quantiles of the delay
 SHARE = 0.95
-"""Share of the commands that the longest delay covers: margins are about a delay that stays,
-a single late command is a disturbance."""
+"""Share of the commands covered by the longest delay: margins concern lasting delays, a single late
+command is a disturbance."""
 
-EXPLAINED = 0.3
-"""A delay explains the applied voltage when what is left is below this share of its steps."""
+MAX_RESIDUAL_SHARE = 0.3
+"""A delay explains the applied voltage if the residual is below this share of its steps."""
 
 
 @dataclass(frozen=True)
 class TransportDelay:
-    """From the stamp of a sample to the arrival of the command that answers it."""
+    """Delay from the stamp of a sample to the arrival of its command."""
 
     usual: float  # median [s]
     longest: float  # that 95 % of the commands keep [s]
@@ -47,13 +47,13 @@ class TransportDelay:
 
 
 def measure_delay(path: Path) -> dict[str, TransportDelay]:
-    """Measure the delay of every wheel's loop from a bag, of those with enough answers."""
+    """Measure the delay of every wheel's loop with enough commands in a bag."""
     found: dict[str, TransportDelay] = {}
     for recording in source.recordings([path]):
         found |= _of_recording(recording)
     if not found:
         raise BagError(
-            f"{path}: no wheel with {LEAST_ANSWERS} motor_command that answer a motor_state; "
+            f"{path}: no wheel with {MIN_COMMANDS} motor_command that answer a motor_state; "
             "record both topics while wheel_pid drives, or give --delay"
         )
     return found
@@ -75,14 +75,14 @@ def _of_recording(recording: source.Recording) -> dict[str, TransportDelay]:
 
 
 def _delay(state: Table, command: Table) -> TransportDelay | None:
-    if state.stamp is None or command.stamp is None or state.stamp.size < LEAST_ANSWERS:
+    if state.stamp is None or command.stamp is None or state.stamp.size < MIN_COMMANDS:
         return None
     answers = np.isin(command.stamp, state.stamp)
-    if np.count_nonzero(answers) < LEAST_ANSWERS:
+    if np.count_nonzero(answers) < MIN_COMMANDS:
         return None
     stamp, log = command.stamp[answers], command.logged[answers]
     offset = clock.fit_clock(state.stamp, state.logged)
-    # On another clock the fastest state stands for no latency at all.
+    # With different clocks, the fastest state defines zero latency.
     one_clock = abs(offset.offset) < clock.SAME_CLOCK
     arrival = 1e-9 * (log - (stamp if one_clock else offset.to_log(stamp)))
     usual, longest = (float(q) for q in np.quantile(arrival, (0.5, SHARE)))
@@ -95,7 +95,7 @@ def _delay(state: Table, command: Table) -> TransportDelay | None:
 
 
 def _until_applied(state: Table, stamp: Integers, voltage: Array, period: float) -> float | None:
-    """Return the delay that explains the voltages that the hardware reports, or None."""
+    """Return the delay that explains the reported voltages, or None."""
     assert state.stamp is not None
     order = np.argsort(stamp, kind="stable")
     stamp, voltage = stamp[order], voltage[order]
@@ -103,7 +103,7 @@ def _until_applied(state: Table, stamp: Integers, voltage: Array, period: float)
     # Delays of up to three samples, in twentieths of one; what these could reach back to.
     inside = (time > stamp[0] + 4e9 * period) & (time < stamp[-1])
     time, acted = time[inside], state.columns["voltage"][which][inside]
-    if time.size < LEAST_ANSWERS or not np.all(np.isfinite(acted)):
+    if time.size < MIN_COMMANDS or not np.all(np.isfinite(acted)):
         return None
     steps = math.sqrt(float(np.mean(np.diff(acted) ** 2)))
     trials = period * np.arange(0, 61) / 20
@@ -111,7 +111,7 @@ def _until_applied(state: Table, stamp: Integers, voltage: Array, period: float)
     for trial in trials:
         shifted = stamp + round(1e9 * trial)
         off = (acted - clock.mean_held(shifted, voltage, "after", time))[1:]
-        # The middle of the errors: a command that was late or lost says nothing of the others.
+        # Trimmed mean of the errors: ignore late and lost commands.
         left.append(math.sqrt(float(np.mean(np.sort(off**2)[: int(0.9 * off.size)]))))
     best = int(np.argmin(left))
-    return float(trials[best]) if left[best] < EXPLAINED * steps else None
+    return float(trials[best]) if left[best] < MAX_RESIDUAL_SHARE * steps else None

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Message definitions: from the bag, from the user's .msg files, from ROS, from rosbags."""
 
 import json
@@ -22,7 +23,7 @@ Lookup = Callable[[str], Fields | None]
 """From a type's full name to its fields, None where they are not known there."""
 
 _STORES = (Stores.ROS2_JAZZY, Stores.ROS2_HUMBLE, Stores.ROS2_FOXY, Stores.ROS2_DASHING)
-_SPOILT = (TypesysError, BagError, ValueError, LookupError, TypeError, RecursionError)
+_DAMAGE = (TypesysError, BagError, ValueError, LookupError, TypeError, RecursionError)
 _LINE = "=" * 80 + "\n"
 
 
@@ -69,7 +70,7 @@ def _ament_file(name: str, suffix: str) -> Path | None:
 
 
 class Types:
-    """Finds what a message consists of; ``files`` are ``.msg`` files, or folders, of the user."""
+    """Definitions of message types; ``files`` are the user's ``.msg`` files or folders."""
 
     def __init__(self, files: Iterable[str | os.PathLike[str]] = ()) -> None:
         self._given: dict[str, Fields] = {}
@@ -94,7 +95,7 @@ class Types:
             raise BagError(f"{file}: not a message definition ({first_line(error)})") from None
 
     def candidates(self, channel: Channel) -> Iterator[Definitions]:
-        """Yield what the channel's type may be, the most trusted first; at least one.
+        """Yield possible definitions of the channel's type, the most trusted first; at least one.
 
         Several distributions changed messages without changing their name; where a bag
         does not define its types, the one that fits the bytes is right.
@@ -106,7 +107,7 @@ class Types:
                 self._count(channel.definition)
                 own = _parse(channel.definition, name, channel.definition_format)
                 yield self._closed(name, [own.get, self._given.get, *stores])
-            except _SPOILT as error:
+            except _DAMAGE as error:
                 reasons.append(f"the bag's own definition cannot be used: {first_line(error)}")
         given: list[Lookup] = [self._named(name).get, self._given.get]
         known = [[_ament, stores[0]], *([store, _ament] for store in stores[1:])]
@@ -122,7 +123,7 @@ class Types:
             )
 
     def _count(self, text: str) -> None:
-        """Refuse definitions that take too long together."""
+        """Refuse definitions that are too long together."""
         self._left -= 0 if text in self._seen else len(text)
         self._seen.add(text)
         if self._left < 0:

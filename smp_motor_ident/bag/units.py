@@ -1,4 +1,5 @@
-"""Units a recording may come in, and what makes SI of them."""
+# SPDX-License-Identifier: Apache-2.0
+"""Units of recordings and their conversion to SI."""
 
 import math
 import re
@@ -9,7 +10,7 @@ from smp_motor_ident.errors import BagError
 
 
 class Unit(NamedTuple):
-    """A factor to SI, times powers of what must be known of the robot besides."""
+    """A factor to SI, times powers of properties of the robot."""
 
     factor: float
     needs: Mapping[str, int] = {}
@@ -90,7 +91,7 @@ def needs(signal: str, unit: str, name: str) -> bool:
 
 
 def written_unit(text: str) -> str | None:
-    """Return the unit that a file writes beside a column's name; None where it is none."""
+    """Return the unit that a file writes next to a column's name; None if it is not a unit."""
     if text.strip() in ("", "-", "1", "."):
         return ""
     for signal in UNITS:
@@ -102,9 +103,9 @@ def written_unit(text: str) -> str | None:
 
 
 def unit_of(signal: str, written: str, name: str) -> str:
-    """Return the unit that a file writes of a signal, or else a word of its name that is one.
+    """Return the unit that a file states for a signal, or else one in the signal's name.
 
-    Empty where there is none but SI.  A single letter is none: ``theta_m`` is the motor's angle.
+    Empty for SI.  A single letter is not a unit: ``theta_m`` is the motor's angle.
     """
     words = re.split(r"[\W_]+(?:per[\W_]+)?|(?<=[a-z]{2})(?=[A-Z])", name)
     ends = [text for k in range(len(words)) for text in (words[k], "/".join(words[k : k + 2]))]
@@ -113,16 +114,16 @@ def unit_of(signal: str, written: str, name: str) -> str:
             unit = check_unit(signal, text) if written or len(text) > 1 else ""
         except BagError:
             continue
-        # What a name may call the signal itself is no unit.
+        # A word that names the signal itself is not a unit.
         if written or unit not in ("", next(iter(UNITS[signal])), "duty", "pwm", "in", "in/s"):
             return unit
     return ""
 
 
 def factor(signal: str, unit: str, known: Mapping[str, float | None]) -> float:
-    """Return what a value in the unit must be multiplied by; BagError names what is missing.
+    """Return the factor from a unit to SI; raise `BagError` if a property is missing.
 
-    What is not known of the robot is None or 0.
+    Unknown properties of the robot are None or 0.
     """
     result, needed = UNITS[signal][unit]
     for name, power in needed.items():

@@ -1,7 +1,8 @@
-"""Decompression that cannot be made to fill the memory.
+# SPDX-License-Identifier: Apache-2.0
+"""Decompress with a limit on memory.
 
-A few bytes of zstd, lz4 or bz2 may stand for gigabytes.  Everything is unpacked in small pieces,
-and all pieces of a recording together may not exceed what its size makes believable; the
+A few bytes of zstd, lz4 or bz2 may expand to gigabytes.  Everything is unpacked in small pieces,
+and all pieces of a recording together may not exceed a multiple of its size; the
 environment variable ``SMP_BAG_UNPACKED`` (bytes, or such as ``8G``) raises that limit.
 """
 
@@ -25,7 +26,7 @@ from smp_motor_ident.errors import BagError
 
 VARIABLE = "SMP_BAG_UNPACKED"
 MAGIC = {b"\x28\xb5\x2f\xfd": "zstd", b"\x04\x22\x4d\x18": "lz4"}
-_FED = 1024  # bytes fed at once: so many take along what came out before damage among them
+_CHUNK = 1024  # bytes fed at once, which limits the loss of output before damage
 _PIECE = 1 << 20
 _DAMAGE = (zstd.ZstdError, RuntimeError, EOFError, OSError, ValueError)
 _ENGINES = {
@@ -36,15 +37,17 @@ _ENGINES = {
 
 
 class Budget:
-    """Bytes that may still be unpacked of one recording, which has ``packed`` as it is."""
+    """Remaining limit of unpacked bytes for a recording of ``packed`` bytes."""
 
     def __init__(self, name: str, packed: int) -> None:
         self.name = name
-        self.limit = _asked() or int(max(UNPACKED_LEAST.value, UNPACKED_RATIO.value * packed))
+        self.limit = _read_user_limit() or int(
+            max(UNPACKED_LEAST.value, UNPACKED_RATIO.value * packed)
+        )
         self.left = self.limit
 
     def take(self, size: int) -> None:
-        """Count bytes; too many are an error that says how to allow them."""
+        """Count bytes; raise an error beyond the limit."""
         self.left -= size
         if self.left < 0:
             raise BagError(
@@ -54,14 +57,14 @@ class Budget:
 
 
 def folder_of(owner: object) -> Path:
-    """Return a new folder for what is unpacked or mended, which goes with its owner."""
+    """Return a new folder for unpacked or repaired files, deleted with its owner."""
     folder = tempfile.mkdtemp(prefix="smp_bag_")
     weakref.finalize(owner, shutil.rmtree, folder, ignore_errors=True)
     return Path(folder)
 
 
-def _asked() -> int:
-    """Return the limit that the user set, 0 where there is none."""
+def _read_user_limit() -> int:
+    """Return the limit that the user set, 0 if none."""
     text = os.environ.get(VARIABLE, "").strip().upper()
     if not text:
         return 0
@@ -76,8 +79,8 @@ def pieces(blocks: Iterable[bytes], kind: str) -> Iterator[bytes]:
     """Unpack all frames of a stream; EOFError where it is cut off."""
     engine: Any = None
     for block in blocks:
-        for k in range(0, len(block), _FED):
-            rest = block[k : k + _FED]
+        for k in range(0, len(block), _CHUNK):
+            rest = block[k : k + _CHUNK]
             while rest:
                 if engine is None or engine.eof:  # another frame follows
                     engine = _ENGINES[kind]()
@@ -90,7 +93,7 @@ def pieces(blocks: Iterable[bytes], kind: str) -> Iterator[bytes]:
 
 
 def decompress(data: bytes, compression: str, budget: Budget) -> bytes:
-    """Decompress a block, or what can be had of one that is cut off."""
+    """Decompress a block, or the readable part of one that is cut off."""
     if compression in ("", "none"):
         return data
     if compression not in _ENGINES:
@@ -101,12 +104,12 @@ def decompress(data: bytes, compression: str, budget: Budget) -> bytes:
             budget.take(len(piece))
             parts.append(piece)
     except _DAMAGE:
-        pass  # what came before the damage is whole
+        pass  # keep the part before the damage
     return b"".join(parts)
 
 
 def unpack_file(path: Path, plain: Path, kind: str, budget: Budget) -> str:
-    """Decompress a file; return what is amiss with it."""
+    """Decompress a file; return a remark on damage, empty if it is whole."""
     try:
         with path.open("rb") as packed, plain.open("wb") as out:
             for piece in pieces(iter(lambda: packed.read(1 << 16), b""), kind):

@@ -1,19 +1,20 @@
-"""A running motor's recent past, read as a bag of it would be."""
+# SPDX-License-Identifier: Apache-2.0
+"""Window of a running motor's recent samples, read like a bag."""
 
 from collections import deque
 from typing import Any
 
 import numpy as np
 
-from smp_motor_control.motor.parameters import SUPPLIES
+from smp_motor_control.motor.parameters import SUPPLY_RANGE_V
 from smp_motor_ident.bag.assemble import assemble
 from smp_motor_ident.bag.mapping import MotorMap, Signal
 from smp_motor_ident.bag.read import OWN_FIELDS
 from smp_motor_ident.bag.storage import Table
 from smp_motor_ident.record import Hardware, Record
 
-CAPACITY = 200_000  # samples that are kept at most
-LEAST = 10  # samples below which there is no record
+CAPACITY = 200_000  # largest number of samples
+MIN_SAMPLES = 10  # samples below which there is no record
 
 
 class Window:
@@ -35,11 +36,11 @@ class Window:
         return self._rows[-1][0] if self._rows else 0
 
     def add(self, stamp: int, state: Any, number: int = 0) -> None:
-        """Take one ``motor_state`` with its publisher's number, 0 where that is not known.
+        """Add one ``motor_state`` with its publisher's number, 0 if unknown.
 
-        A stamp [ns] that was set back begins the window anew.
+        A stamp [ns] that was set back clears the window.
         """
-        if not abs(state.voltage) <= SUPPLIES[1]:
+        if not abs(state.voltage) <= SUPPLY_RANGE_V[1]:
             return
         rows = self._rows
         if rows and stamp <= rows[-1][0]:
@@ -51,8 +52,8 @@ class Window:
             rows.popleft()
 
     def record(self) -> Record | None:
-        """Return what is held, refused as a bag of it would be; None below 10 samples."""
-        if len(self) < LEAST:
+        """Return the window as a record, checked like a bag; None below 10 samples."""
+        if len(self) < MIN_SAMPLES:
             return None
         time, numbers, *values = map(np.array, zip(*self._rows, strict=True))
         columns = dict(zip(OWN_FIELDS.values(), values))

@@ -1,8 +1,9 @@
-"""Writing bags that are whole at every moment: a killed recorder leaves a readable bag.
+# SPDX-License-Identifier: Apache-2.0
+"""Write bags that stay readable if the recorder is killed.
 
-The MCAP library closes the file at every flush: what closes it is written in one go with the
-messages before it, and overwritten by the next flush.  So the file on disk is a closed MCAP file
-up to its last flush, with a metadata.yaml that counts the same messages.
+The MCAP library closes the file at every flush: the closing records are written in one go with
+the messages before them, and overwritten by the next flush.  So the file on disk is a closed MCAP
+file up to its last flush, with a metadata.yaml that counts the same messages.
 """
 
 import contextlib
@@ -22,8 +23,7 @@ from smp_motor_ident.errors import BagError
 
 FLUSH_PERIOD = 0.5
 SHARE = 0.05
-"""Of the time that flushing takes at most: what closes a file grows with it, so that hours later
-it is written less often."""
+"""Largest share of the time for flushing; longer files are flushed less often."""
 
 _FOREVER = {"sec": 9223372036, "nsec": 854775807}
 DEFAULT_QOS: dict[str, Any] = {
@@ -41,7 +41,7 @@ DEFAULT_QOS: dict[str, Any] = {
 
 
 class _Plain(getattr(yaml, "CSafeDumper", yaml.SafeDumper)):  # type: ignore[misc]
-    """Writes what occurs twice twice: not every reader of metadata follows aliases."""
+    """YAML writer without aliases, which not every reader of metadata follows."""
 
     def ignore_aliases(self, data: Any) -> bool:
         return True
@@ -53,7 +53,7 @@ def _dumped(content: Any) -> str:
 
 @dataclass
 class _Topic:
-    """A topic of the bag: its channel, and what metadata.yaml says of it but for the count."""
+    """A topic of the bag: its channel, and its entry of metadata.yaml without the count."""
 
     id: int
     type_name: str
@@ -62,7 +62,7 @@ class _Topic:
 
 
 class _Draft:
-    """The end of the file as the library writes it, until a flush brings it to the disk."""
+    """Buffer for the end of the file until a flush."""
 
     def __init__(self) -> None:
         self.begin = 0
@@ -76,14 +76,14 @@ class _Draft:
         return len(data)
 
     def flush(self) -> None:
-        """Do nothing: messages come to the disk together with what closes the file."""
+        """Do nothing: messages are written together with the closing records."""
 
 
 class BagWriter:
-    """Writes an MCAP bag folder as rosbag2 of ROS 2 Jazzy lays it out (metadata version 9).
+    """Writer of an MCAP bag folder in the layout of rosbag2 of ROS 2 Jazzy (metadata version 9).
 
-    The folder must not exist.  With messages coming, what came within ``flush_period`` [s] is lost
-    at most when the process is killed; of a bag of many hours, what came within some seconds.
+    The folder must not exist.  A kill of the process loses at most the messages of the last
+    ``flush_period`` [s]; after many hours, those of some seconds.
 
     Examples
     --------
@@ -136,11 +136,11 @@ class BagWriter:
         *,
         numbered: bool = False,
     ) -> bool:
-        """Announce a topic; `write` does it by itself where the QoS does not matter.
+        """Add a topic; `write` adds missing ones with a default QoS.
 
-        ``qos`` has a profile for each publisher, with keys as in `DEFAULT_QOS`; ``numbered`` says
-        that `write` will be given the publisher's own numbers.  False where nobody here knows the
-        type, so that its messages are kept without their definition.
+        ``qos`` has a profile for each publisher, with keys as in `DEFAULT_QOS`; ``numbered`` tells
+        that `write` gets the publisher's own numbers.  Returns False for an unknown type, whose
+        messages are stored without their definition.
         """
         with self._lock:
             if topic in self._topics:
@@ -164,7 +164,7 @@ class BagWriter:
             return bool(type_hash)
 
     def _schema(self, type_name: str) -> tuple[int, str]:
-        """Return the number of a type in the file, and its hash; empty where nobody knows it."""
+        """Return the number of a type in the file, and its hash, empty if unknown."""
         if type_name not in self._schemas:
             try:
                 text, type_hash = definition(type_name)
@@ -187,8 +187,8 @@ class BagWriter:
     ) -> None:
         """Write a message, serialized (CDR) with its four bytes of encapsulation.
 
-        ``stamp`` is when it came, ``sent`` when it was published, in nanoseconds since 1970;
-        ``number`` is the publisher's own, 0 where that is not known.
+        ``stamp`` is the time of arrival, ``sent`` of publication, in nanoseconds since 1970;
+        ``number`` is the publisher's own, 0 if unknown.
         """
         with self._lock:
             if self._closed:
@@ -209,7 +209,7 @@ class BagWriter:
             self.flush(force=bool(self._draft.data))  # the library has a whole chunk
 
     def flush(self, *, force: bool = False) -> None:
-        """Bring what was written to the disk, where the flush period is over or it is forced."""
+        """Write pending messages to the disk once the flush period is over, or if forced."""
         begun = time.monotonic()
         if self._closed or (not force and begun - self._flushed < self._period):
             return
@@ -237,7 +237,7 @@ class BagWriter:
             view, position = view[done:], position + done
 
     def _write_metadata(self) -> None:
-        """Write metadata.yaml beside, then put it in place at once."""
+        """Write metadata.yaml to a temporary file, then rename it."""
         total = sum(self.counts.values())
         first, last = self._range if total else (0, 0)
         begin = {"nanoseconds_since_epoch": first}
@@ -264,7 +264,7 @@ class BagWriter:
         draft.replace(target)
 
     def close(self) -> None:
-        """Write what is left and close the bag; nothing happens the second time."""
+        """Write pending messages and close the bag; closing twice does nothing."""
         with self._lock:
             if self._closed:
                 return
@@ -281,5 +281,5 @@ class BagWriter:
         return self
 
     def __exit__(self, *error: object) -> None:
-        """Close the bag, also after an error: what was recorded is kept."""
+        """Close the bag, also after an error, and keep the recorded messages."""
         self.close()

@@ -1,1 +1,2 @@
+# SPDX-License-Identifier: Apache-2.0
 """Command-line tools: arguments, progress and exit codes, nothing else."""

@@ -1,4 +1,5 @@
-"""tune --apply: new gains into running wheel nodes, on trial."""
+# SPDX-License-Identifier: Apache-2.0
+"""tune --apply: set new gains in running wheel nodes, on trial."""
 
 import argparse
 import math
@@ -13,7 +14,7 @@ from smp_motor_ident.errors import ParameterError
 
 
 def apply(wanted: Mapping[str, Mapping[str, Any]], arguments: argparse.Namespace) -> int:
-    """Set the gains of running wheels, watch them, and take them back if a loop misbehaves."""
+    """Set the gains of running wheels, watch them, and restore the old ones on misbehaviour."""
     limits = [values.get("u_clamp_max", math.inf) for values in wanted.values()]
     supply = max((limit for limit in limits if math.isfinite(limit)), default=12.0)
     with connect("tune", arguments.ros_arguments) as robot:
@@ -30,9 +31,9 @@ def apply(wanted: Mapping[str, Mapping[str, Any]], arguments: argparse.Namespace
     if not outcome.reason:
         print(f"kept: no loop misbehaved within {arguments.watch:g} s")
         return 0
-    print(f"taken back after {outcome.after:.2f} s: {outcome.reason}")
+    print(f"restored the old gains after {outcome.after:.2f} s: {outcome.reason}")
     for wheel in outcome.missing:
-        print(f"{wheel} did not return: if it drives on it does so with the new gains")
+        print(f"{wheel} does not answer: it may still use the new gains")
     return 1
 
 
@@ -51,7 +52,7 @@ def from_file(path: Path) -> dict[str, dict[str, Any]]:
 def _changes(
     old: Mapping[str, Mapping[str, Any]], wanted: Mapping[str, Mapping[str, Any]]
 ) -> dict[str, dict[str, Any]]:
-    """Print what will change, and return it."""
+    """Print and return the changes."""
     new: dict[str, dict[str, Any]] = {}
     for wheel, values in wanted.items():
         had = old[wheel]

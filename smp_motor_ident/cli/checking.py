@@ -1,4 +1,5 @@
-"""The small test of every wheel that ``commission`` begins with: live part of the checks."""
+# SPDX-License-Identifier: Apache-2.0
+"""Test every wheel briefly at the beginning of ``commission``."""
 
 import math
 from collections.abc import Callable, Mapping, Sequence
@@ -8,9 +9,9 @@ from typing import Any
 from smp_motor_control.motor.file import MotorEntry
 from smp_motor_control.wheel.protection import Bounds
 from smp_motor_ident.bag.read import described
-from smp_motor_ident.diagnosis import wheel_test as judged
-from smp_motor_ident.diagnosis.wheel_checks import Robot, judge
-from smp_motor_ident.diagnosis.wheel_test import Figures, Phase, Trace, answers_well, settled
+from smp_motor_ident.commission import wheel_test as judged
+from smp_motor_ident.commission.wheel_checks import Robot, judge
+from smp_motor_ident.commission.wheel_test import Figures, Phase, Trace, answers_well, settled
 from smp_motor_ident.finding import Finding
 from smp_motor_ident.record import Hardware
 
@@ -19,25 +20,25 @@ LONGEST_HOLD = 2.0  # a voltage is held for so long where the wheel is slow [s]
 RAMP = 0.15  # growth of the voltage until the wheel turns [of the supply per second]
 GROWTH = 2.0  # of the voltage from one level to the next
 FIRST = (1.5, 0.05)
-"""First level: so many times what started the wheel, and so much of the supply more."""
+"""First level: multiple of the starting voltage, plus a share of the supply."""
 
-PATIENCE = 5.0  # how long descriptions are waited for [s]
+TIMEOUT_S = 5.0  # longest wait for descriptions [s]
 TURNED = 12.0  # counts after which a ramp ends: the wheel turns
 
 
 @dataclass(frozen=True)
 class Checked:
-    """What the checks came to."""
+    """Result of the wheel checks."""
 
     findings: tuple[Finding, ...]  # in the order of the checks
     figures: Mapping[str, Figures]  # by wheel
-    amplitude: float  # voltage at which every wheel answers well, as far as the limit allows [V]
-    speed: float  # of the fastest wheel at that voltage, as far as they show [rad/s]; NaN for none
+    amplitude: float  # voltage at which every wheel responds well, within the limit [V]
+    speed: float  # of the fastest wheel at that voltage [rad/s]; NaN if unknown
 
 
 @dataclass
 class _Way:
-    """A wheel under test: what drives it, and the phases that it has been through."""
+    """A wheel under test: its driving process and its completed phases."""
 
     test: Any
     wheel: str
@@ -92,13 +93,13 @@ def check_wheels(
     known: Mapping[str, MotorEntry],
     say: Callable[[str], None],
 ) -> Checked:
-    """Test the wheels one after the other, at most at ``limit`` volts, and judge what they did."""
+    """Test the wheels one by one, at most at ``limit`` volts, and check their responses."""
     from smp_motor_control.nodes import wheel_test
 
-    said = wheel_test.descriptions(client, wheels, PATIENCE)
+    said = wheel_test.read_descriptions(client, wheels, TIMEOUT_S)
     hardware = {wheel: described(said[wheel]) if wheel in said else Hardware() for wheel in wheels}
     phases: list[Phase] = []
-    counters = {wheel: wheel_test.counter(one) for wheel, one in hardware.items()}
+    counters = {wheel: wheel_test.make_counter(one) for wheel, one in hardware.items()}
     with wheel_test.WheelTest(client, counters, bounds).open() as test:
         for wheel in wheels:
             say(wheel)
@@ -120,7 +121,7 @@ def check_wheels(
         judged.moved_with(traces, phases),
         {w: known[w].parameters.dc_gain for w in wheels if w in known},
         {w: known[w].gearbox.ratio for w in wheels if w in known},
-        wheel_test.battery(client),
+        wheel_test.read_battery(client),
     )
     levels = [one.level for one in found.values() if math.isfinite(one.level)]
     amplitude = max(levels, default=limit)

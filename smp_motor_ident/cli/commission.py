@@ -1,4 +1,5 @@
-"""``commission``: the whole way on the user's own running robot, wheels off the ground."""
+# SPDX-License-Identifier: Apache-2.0
+"""``commission``: identify and tune the user's running robot, wheels off the ground."""
 
 from functools import partial
 
@@ -7,10 +8,10 @@ from smp_motor_ident.cli.frame import OF_ROS, Parser, number, run
 NAME = "commission"
 
 DESCRIPTION = """\
-Check the wheels of the running robot, excite and record them, identify the motors, judge them by a
-run that no fit has seen, design gains, and drive with these on trial. With --apply gains that pass
-stay. Put the robot on blocks first: the wheels turn. Controllers that are active are switched off
-meanwhile and on again at the end.
+Check the wheels of the running robot, excite and record them, identify the motors, validate the
+models on another run, design gains, and test them in a drive. With --apply gains that pass stay.
+Put the robot on blocks first: the wheels turn. Active controllers are switched off meanwhile and
+on again at the end.
 """
 
 

@@ -1,7 +1,8 @@
-"""What ``commission`` does: the whole way on the user's own running robot.
+# SPDX-License-Identifier: Apache-2.0
+"""Run ``commission``: check, record, identify, tune and verify a running robot.
 
-Figures of the checks, recordings, identification and gains are kept as soon as each is complete.  A
-resumed run does the rest at the same voltages, and so ends as one that was not interrupted.
+Results of the checks, recordings, identification and gains are stored as soon as each is complete.
+A resumed run does the rest at the same voltages, and gives the same results.
 """
 
 import argparse
@@ -20,10 +21,10 @@ from smp_motor_ident import bag
 from smp_motor_ident.cli import checking, commission, driving, plan, protocol, steps, verifying
 from smp_motor_ident.cli.processes import ProcessError, Processes, connect
 from smp_motor_ident.cli.protocol import Protocol
-from smp_motor_ident.diagnosis import validation_run, wheel_limits, winding
+from smp_motor_ident.commission import validation_run, wheel_limits, winding
 from smp_motor_ident.errors import ParameterError
-from smp_motor_ident.estimation.simulation import simulate
 from smp_motor_ident.finding import Finding
+from smp_motor_ident.infer.validation import simulate
 from smp_motor_ident.report.document import read_identification
 from smp_motor_ident.result import Estimate
 
@@ -33,10 +34,10 @@ AMPLITUDE, DURATION = 6.0, 15.0
 DRAFT = "recording"  # folder of a recording until it is whole
 ANSWER = 2.0  # a controller that runs is discovered by then [s]
 LOOKS, ALIKE = 15, 4
-"""Wheels are looked for at most so often, until so many looks [1 s each] find the same."""
+"""Largest number of searches for wheels [1 s each], and equal results in a row that end them."""
 
 UNRELIABLE = "unreliable_identification"
-"""Code of the finding that an identification is not to be designed on."""
+"""Code of the finding on an identification unsuitable for design."""
 
 
 _say = partial(print, flush=True)
@@ -52,12 +53,12 @@ class Session:
     schedule: plan.Schedule
 
     def begin(self, part: str, how: str = "") -> None:
-        """Print the next part, and how long all takes."""
+        """Print the next part, and the remaining time."""
         _say(self.schedule.begin(part, how))
 
 
 def work(arguments: argparse.Namespace) -> int:
-    """Do what the arguments say."""
+    """Run the command and return its exit code."""
     folder = _checked(arguments)
     known = load_motors(arguments.motors) if arguments.motors else {}
     begun = Protocol(folder, arguments.accept)
@@ -70,7 +71,7 @@ def work(arguments: argparse.Namespace) -> int:
         return _commission(arguments, folder, known)
     finally:
         if folder.is_dir() and not (folder / protocol.NAME).exists():
-            shutil.rmtree(folder)  # nothing but logs of what did not begin
+            shutil.rmtree(folder)  # it has only logs, the wheels never moved
 
 
 def _as_begun(arguments: argparse.Namespace, document: dict[str, Any]) -> None:
@@ -109,7 +110,7 @@ def _commission(arguments: argparse.Namespace, folder: Path, known: Mapping[str,
 
 
 def _begin(arguments: argparse.Namespace, robot: steps.Robot) -> Session | None:
-    """Ask before anything moves; what was done at other voltages or of other wheels is not kept."""
+    """Ask before anything moves; discard results at other voltages or of other wheels."""
     made = Protocol(robot.folder, arguments.accept)
     asked = {name: getattr(arguments, name) for name in ("amplitude", "duration")}
     asked["wheels"] = list(robot.wheels)
@@ -119,7 +120,7 @@ def _begin(arguments: argparse.Namespace, robot: steps.Robot) -> Session | None:
         return None
     if not same:
         if "asked" in made.document:
-            _say("wheels, amplitude or duration are others than before: all of it is done anew")
+            _say("wheels, amplitude or duration have changed: all steps are repeated")
         made.begin(robot.wheels, asked)
     left = [one for one in _recordings(arguments, made) if not (same and _is_kept(robot, one))]
     if left or (arguments.tuning and not made.has("tuning_page")):
@@ -137,7 +138,7 @@ def _begin(arguments: argparse.Namespace, robot: steps.Robot) -> Session | None:
 
 
 def _tell_controllers(arguments: argparse.Namespace, robot: steps.Robot) -> None:
-    """Say which wheels drive on a controller of our own, which no gains can be left in."""
+    """Report wheels without a controller, for which one is started for the drive."""
     robot.client.until(lambda: not robot.uncontrolled(), ANSWER)
     missing = ", ".join(robot.uncontrolled())
     if missing and arguments.apply:
@@ -160,7 +161,7 @@ def _is_kept(robot: steps.Robot, one: plan.Recording) -> bool:
 
 
 def _move(session: Session, known: Mapping[str, Any]) -> None:
-    """Check the wheels, then record them excited, as far as that is not done."""
+    """Check the wheels, then record them under excitation; skip completed steps."""
     arguments, made = session.arguments, session.protocol
     if not made.has("checked"):
         _check(session, known)
@@ -170,7 +171,7 @@ def _move(session: Session, known: Mapping[str, Any]) -> None:
 
 
 def _check(session: Session, known: Mapping[str, Any]) -> None:
-    """Check the wheels one by one; stop where another hand must mend something."""
+    """Check the wheels one by one; stop at faults that the user must repair."""
     arguments, robot, made = session.arguments, session.robot, session.protocol
     bounds = Bounds(speed=arguments.max_speed or 0.0, current=arguments.max_current)
     checked = checking.check_wheels(
@@ -184,7 +185,7 @@ def _check(session: Session, known: Mapping[str, Any]) -> None:
 
 
 def _record(session: Session, one: plan.Recording) -> None:
-    """Record the wheels while one signal moves them; whatever ends it, nobody moves them then."""
+    """Record the wheels under one signal; stop them at the end in any case."""
     arguments, robot = session.arguments, session.robot
     robot.client.refuse_second_reporters(robot.wheels)
     speed = session.protocol.document.get("speed")
@@ -218,7 +219,7 @@ def too_hot(folder: Path, earlier: Sequence[plan.Recording], last: plan.Recordin
 
 
 def _design(session: Session) -> driving.Designed:
-    """Identify and tune, as far as that is not done; what they write appears as a whole."""
+    """Identify and tune, skipping completed steps; write each result in one piece."""
     arguments, robot, made = session.arguments, session.robot, session.protocol
     folder, gains = robot.folder, robot.folder / "gains.yaml"
     known = (folder / plan.FITTED / plan.FURTHER).is_dir()
@@ -265,7 +266,7 @@ def _identify(session: Session, part: str) -> dict[str, Estimate]:
 
 
 def _verify(session: Session, designed: driving.Designed) -> str:
-    """Drive with the gains on trial, judge the drive, and return what became of them."""
+    """Drive with the gains on trial, check the drive, and return the outcome."""
     robot, made = session.robot, session.protocol
     robot.client.refuse_second_reporters(robot.wheels)
     session.schedule.add(
@@ -296,7 +297,7 @@ def _verify(session: Session, designed: driving.Designed) -> str:
 
 
 def _found(client: Any) -> tuple[str, ...]:
-    """Return the wheels that report: a busy machine's are discovered seconds apart."""
+    """Return the wheels that report; on a busy machine they are discovered seconds apart."""
     looks: list[tuple[str, ...]] = []
     while len(looks) < LOOKS:
         looks.append(tuple(client.find_wheels()))
@@ -306,7 +307,7 @@ def _found(client: Any) -> tuple[str, ...]:
 
 
 def unreliable(estimates: Mapping[str, Estimate]) -> list[Finding]:
-    """Return why motors that were identified are not to be designed on."""
+    """Return the reasons against a design on the identified motors."""
     return [
         Finding(UNRELIABLE, "refused", f"{wheel}: {one.message}", one.evidence, one.advice)
         for wheel, estimate in estimates.items()
@@ -316,7 +317,7 @@ def unreliable(estimates: Mapping[str, Estimate]) -> list[Finding]:
 
 
 def validated(estimates: Mapping[str, Estimate], fitted: Path, held_out: Path) -> list[Finding]:
-    """Judge every motor by a run that its fit has not seen."""
+    """Validate every motor on the held-out run."""
     found = []
     read = {path: bag.read_experiments([str(path)]) for path in (fitted, held_out)}
     for wheel, one in estimates.items():

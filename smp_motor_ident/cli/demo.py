@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """``demo``: a simulated robot from four unknown motors to four tuned wheels, checked at the end."""
 
 from functools import partial

@@ -1,4 +1,5 @@
-"""What ``demo`` does: a simulated robot from four unknown motors to four tuned wheels."""
+# SPDX-License-Identifier: Apache-2.0
+"""Run ``demo``: a simulated robot from four unknown motors to four tuned wheels."""
 
 import argparse
 import os
@@ -10,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from smp_motor_control import LEFT, RIGHT, WHEELS, controller_of
-from smp_motor_control.motor.file import load_motors, paper_motors
+from smp_motor_control.motor.file import find_paper_motors, load_motors
 from smp_motor_control.nodes import loopback
 from smp_motor_ident.cli import demo, driving, plan, steps, verdict
 from smp_motor_ident.cli.processes import Processes, connect, free_domain
@@ -22,7 +23,7 @@ PLAN = (
     steps.Excitation("square", 8.0, 10.0),
     steps.Excitation("fourier", 14.0, 11.0),
 )
-"""What moves the wheels while they are recorded."""
+"""Excitation of the wheels while they are recorded."""
 
 DRIVE = (
     ("straight", 0.20, 0.0, 2.5),
@@ -33,26 +34,25 @@ DRIVE = (
 """Manoeuvres: name, m/s, rad/s, s."""
 
 STALL = 0.008
-"""A robot whose computer was busy elsewhere for so long [s] shows that, not its gains: the drive
-is repeated, whatever it showed. The one that was disturbed least is shown, and judged only
-where the machine kept pace."""
+"""Pause of the computer [s] after which a drive is repeated; the least disturbed drive is shown,
+and judged only if the machine kept pace."""
 
 ATTEMPTS = 3
 
 
 def work(arguments: argparse.Namespace) -> int:
-    """Do what the arguments say."""
+    """Run the command and return its exit code."""
     die_with_parent(signal.SIGTERM)
     begun = time.monotonic()
 
     def say(text: str) -> None:
         print(f"[{time.monotonic() - begun:5.1f} s] {text}", flush=True)
 
-    motors = Path(arguments.motors) if arguments.motors else paper_motors()
+    motors = Path(arguments.motors) if arguments.motors else find_paper_motors()
     truth = load_motors(motors, WHEELS)
     folder = _fresh(Path(arguments.output))
     domain = free_domain() if arguments.domain is None else arguments.domain
-    os.environ.update({"ROS_DOMAIN_ID": str(domain), **loopback.environment()})
+    os.environ.update({"ROS_DOMAIN_ID": str(domain), **loopback.loopback_environment()})
     with Processes(folder / "logs") as processes, connect(demo.NAME) as client:
         robot = start(steps.Robot(processes, client, WHEELS, folder), motors, arguments.rate)
         say(f"running: motor_plant, {len(WHEELS)} wheel_pid, skid_steer (ROS domain {domain})")
@@ -95,8 +95,8 @@ def start(robot: steps.Robot, motors: Path, rate: float) -> steps.Robot:
     processes.start("motor_plant", "motor_plant", *given, priority=1)
     processes.start("skid_steer", "skid_steer", priority=1)
     robot.start_controllers(WHEELS)
-    client.wait_for_nodes(["motor_plant", "skid_steer"], timeout=steps.PATIENCE)
-    client.wait_for_wheels(robot.wheels, timeout=steps.PATIENCE)
+    client.wait_for_nodes(["motor_plant", "skid_steer"], timeout=steps.TIMEOUT_S)
+    client.wait_for_wheels(robot.wheels, timeout=steps.TIMEOUT_S)
     return robot
 
 

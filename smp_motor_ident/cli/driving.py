@@ -1,4 +1,5 @@
-"""A recorded drive: the changes of set-point of its wheels, measured and predicted."""
+# SPDX-License-Identifier: Apache-2.0
+"""Compare measured and predicted changes of set-point in a recorded drive."""
 
 import json
 from collections.abc import Mapping, Sequence
@@ -22,16 +23,16 @@ from smp_motor_ident.result import Estimate
 from smp_motor_ident.tune import verification
 from smp_motor_ident.tune.verification import Change
 
-LEAST_CHANGE = 0.8  # a smaller change of the set-point [rad/s, wheel] is no step to judge
+MIN_CHANGE = 0.8  # a smaller change of the set-point [rad/s, wheel] is no step to judge
 LEAD = 0.3  # rest before a drive that is simulated with it [s]
-MOST_SAMPLES = 1e6  # of a drive, which takes seconds
+MAX_SAMPLES = 1e6  # of a drive, which takes seconds
 STATE = ("encoder_count", "position", "voltage")
 ANSWER = ("setpoint", "age", "dt", "output")
 
 
 @dataclass(frozen=True)
 class Designed:
-    """What a drive is judged by, by wheel."""
+    """Designs, predictions and limits that a drive is compared with, by wheel."""
 
     estimates: Mapping[str, Estimate]  # the motors
     gains: Mapping[str, Mapping[str, Any]]  # parameters of ``wheel_pid``, as in ``gains.yaml``
@@ -46,7 +47,7 @@ def designed(estimates: Mapping[str, Estimate], gains: Path) -> Designed:
 
 @dataclass(frozen=True)
 class Driven:
-    """What was recorded of one wheel: its samples, and the answers of its controller."""
+    """Recorded samples of one wheel and the commands of its controller."""
 
     state: Table
     answers: Table
@@ -85,7 +86,7 @@ def moves_in(segments: Sequence[tuple[str, float, float]], answers: Table) -> li
         final = asked[during[-1]]
         first = during[np.argmax(asked[during] == final)]
         before = float(asked[max(first - 1, 0)])
-        if abs(final - before) >= LEAST_CHANGE:
+        if abs(final - before) >= MIN_CHANGE:
             at = float(seconds[first])
             moves.append(Move(name, at, before, float(final), end - at))
     return moves
@@ -118,7 +119,7 @@ def changes_of(
     latest = np.searchsorted(answers.seconds, instants, side="right") - 1
     asked = np.where(latest < 0, 0.0, answers.columns["setpoint"][latest])
     step = float(entry["loop"]["sample_time"])
-    if np.ptp(instants) > MOST_SAMPLES * step:
+    if np.ptp(instants) > MAX_SAMPLES * step:
         raise ProcessError(
             f"{wheel}: the stamps of the drive span {np.ptp(instants):.3g} s at {step:.3g} s a "
             "sample: a clock was set meanwhile, or two nodes publish motor_state. Look at the "
@@ -170,14 +171,14 @@ def drive_figure(
 
 
 def longest_stall(drive: Mapping[str, Driven]) -> float:
-    """Return how long the machine that simulates stood still at worst [s]."""
+    """Return the longest pause of the simulating machine [s]."""
     gaps = (float(np.max(np.diff(one.state.seconds))) for one in drive.values())
     ages = (float(np.max(one.answers.columns["age"])) for one in drive.values())
     return max(*gaps, *ages)
 
 
 def wheel_angle(state: Table, hardware: Hardware) -> Array:
-    """Return the wheel's angle as its counts tell it, where there are counts."""
+    """Return the wheel's angle from counts, if there are any."""
     if not hardware.counts_per_revolution:
         return state.columns["position"]
     turn = 2 * np.pi / hardware.counts_per_revolution

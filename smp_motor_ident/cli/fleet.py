@@ -1,8 +1,9 @@
+# SPDX-License-Identifier: Apache-2.0
 """``identify --fleet``: every recording by itself, over all cores or a cluster, in one table.
 
-Each recording's result is kept in ``DIR/done`` under what it depends on: names, sizes and times
-of its files, the options, and the version.  What is there is not computed again, so that a run that
-was cut off goes on where it was; a recording that fails is a row with its reason.
+Each recording's result is kept in ``DIR/done``, keyed by names, sizes and times of its files, the
+options and the version.  Existing results are not computed again, so an interrupted run resumes;
+a recording that fails becomes a row with its reason.
 """
 
 import argparse
@@ -27,7 +28,7 @@ from smp_motor_ident.report import fleet, words
 from smp_motor_ident.report.document import check_free, write_together
 from smp_motor_ident.result import plain
 
-TRIES = 2  # how often a recording is begun that takes its worker with it
+MAX_TRIES = 2  # largest number of tries for a recording that kills its worker
 
 Results = Iterator[tuple[str, list[fleet.Row]]]
 """Paths of recordings, each with its rows."""
@@ -73,7 +74,7 @@ def work(
 
 
 def _key(path: Path, options: str) -> str:
-    """Return what a result depends on, as a name."""
+    """Return the key of a result: a hash of all that it depends on."""
     if not path.exists():
         raise BagError(f"{path}: no such file or folder")
     parts = sorted(path.rglob("*")) if path.is_dir() else [path]
@@ -84,7 +85,7 @@ def _key(path: Path, options: str) -> str:
 
 
 def identify_one(path: str, settings: tuple[Any, ...]) -> list[fleet.Row]:
-    """Return what came out for one recording, a row a wheel; a failure is a row too."""
+    """Return the rows of one recording, one per wheel; a failure is a row too."""
     mapping, model, fixed = settings
     rows = []
     try:
@@ -116,7 +117,7 @@ def _row(path: str, **what: Any) -> fleet.Row:
 
 
 def _results(paths: Sequence[str], settings: tuple[Any, ...], scheduler: str | None) -> Results:
-    """Yield results as they come; a worker that dies takes nothing with it but its own try."""
+    """Yield results as they come; a dying worker loses only its own recording."""
     if scheduler:
         yield from on_cluster(paths, settings, scheduler)
         return
@@ -135,14 +136,14 @@ def _results(paths: Sequence[str], settings: tuple[Any, ...], scheduler: str | N
                 # Which one it was is not known: those under way are tried again, one at a time.
                 for path in list(tries)[: 1 if cores == 1 else cores]:
                     tries[path] += 1
-        for path in [p for p, n in tries.items() if n >= TRIES]:
+        for path in [p for p, n in tries.items() if n >= MAX_TRIES]:
             del tries[path]
             why = f"{path}: its worker was ended, perhaps for its memory"
             yield path, [_row(path, failure=why, lost=True)]
 
 
 def on_cluster(paths: Sequence[str], settings: tuple[Any, ...], address: str) -> Results:
-    """Yield results as workers of a Dask cluster give them; it repeats what a dead one had."""
+    """Yield results from the workers of a Dask cluster, which reruns the jobs of dead workers."""
     try:
         from dask import distributed
     except ImportError:
@@ -153,7 +154,7 @@ def on_cluster(paths: Sequence[str], settings: tuple[Any, ...], address: str) ->
     try:
         client = cast(Callable[..., Any], distributed.Client)(address, timeout="10s")
     except OSError as error:
-        raise ParameterError(f"--scheduler {address}: nobody answers there ({error})") from None
+        raise ParameterError(f"--scheduler {address}: no answer ({error})") from None
     with client:
         futures = {client.submit(identify_one, p, settings, pure=False): p for p in paths}
         for future in call(futures):

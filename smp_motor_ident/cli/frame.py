@@ -1,4 +1,5 @@
-"""What every command-line tool has in common: one-line errors, exit codes, progress."""
+# SPDX-License-Identifier: Apache-2.0
+"""Common code of all command-line tools: one-line errors, exit codes, progress."""
 
 import argparse
 import gc
@@ -19,7 +20,7 @@ from smp_motor_control.ros_arguments import split_arguments
 from smp_motor_ident.cli.interruption import check, interruptible
 
 INTERRUPTED = 130  # exit code after Ctrl-C, as shells have it
-PATIENCE = 2.0  # where progress goes to no terminal, a step is named when it has taken so long [s]
+TIMEOUT_S = 2.0  # where progress goes to no terminal, a step is named when it has taken so long [s]
 
 
 OF_ROS = "A robot in a namespace: end the line with --ros-args -r __ns:=/robot1."
@@ -31,7 +32,7 @@ Work = Callable[[argparse.Namespace], int | None]
 
 
 class Parser(argparse.ArgumentParser):
-    """An argument parser whose complaint is one line."""
+    """An argument parser with one-line errors."""
 
     def error(self, message: str) -> NoReturn:
         """End with exit code 2."""
@@ -54,21 +55,21 @@ class _Output:
             os.dup2(os.open(os.devnull, os.O_WRONLY), self._stream.fileno())
 
     def write(self, text: str) -> int:
-        """Write, or drop what nobody reads."""
+        """Write, or drop the text if the reader is gone."""
         self._guarded(self._stream.write, text)
         return len(text)
 
     def flush(self) -> None:
-        """Flush, or drop what nobody reads."""
+        """Flush, or drop the text if the reader is gone."""
         self._guarded(self._stream.flush)
 
 
 def run(made: Callable[[], Parser], work: Work | str, argv: Sequence[str] | None = None) -> int:
-    """Parse, do the work, and turn whatever happens into a line and an exit code."""
+    """Parse the arguments, run the tool, and turn errors into a line and an exit code."""
     parser, before = made(), sys.stdout
     stream = before or open(os.devnull, "w")  # noqa: SIM115  (closed by the shell: None)
     if isinstance(stream, io.TextIOWrapper):
-        stream.reconfigure(errors="backslashreplace")  # of a path that is no UTF-8
+        stream.reconfigure(errors="backslashreplace")  # a path may not be UTF-8
     sys.stdout = _Output(stream)
     try:
         given = sys.argv[1:] if argv is None else argv
@@ -149,7 +150,7 @@ def number(low: float, high: float = float("inf")) -> Callable[[str], float]:
 
 @contextmanager
 def progress(program: str, quiet: bool = False) -> Iterator[Callable[..., None]]:
-    """Show what takes time, by its text and share of the work: a moving line, or a line each."""
+    """Show the progress of long steps as a moving line, or a line each without a terminal."""
     if quiet:
         yield lambda text, share=None: None
     elif sys.stderr.isatty():
@@ -175,7 +176,7 @@ def _lines(program: str) -> Iterator[Callable[..., None]]:
     def watch() -> None:
         printed = 0
         while not over.wait(0.25):
-            if len(steps) > printed and time.monotonic() - steps[-1][1] > PATIENCE:
+            if len(steps) > printed and time.monotonic() - steps[-1][1] > TIMEOUT_S:
                 printed = len(steps)
                 print(f"{program}: {steps[-1][0]} ...", file=sys.stderr, flush=True)
 

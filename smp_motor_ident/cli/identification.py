@@ -1,4 +1,5 @@
-"""What ``identify`` does: read, estimate the wheels side by side, write, and say what came out."""
+# SPDX-License-Identifier: Apache-2.0
+"""Run ``identify``: read, estimate the wheels in parallel, write and print the results."""
 
 from __future__ import annotations
 
@@ -15,15 +16,15 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from smp_motor_ident import bag, likelihood
+from smp_motor_ident import bag
+from smp_motor_ident import simulate as simulation
 from smp_motor_ident.cli import frame, tables, workers
 from smp_motor_ident.cli.identify import NAME
 from smp_motor_ident.compilation import load
-from smp_motor_ident.diagnosis.identifiability import what_next
-from smp_motor_ident.diagnosis.validation import split
 from smp_motor_ident.errors import BagError, InsufficientExcitationError, ParameterError, SmpError
 from smp_motor_ident.estimate import estimate
-from smp_motor_ident.estimation.simulation import simulate
+from smp_motor_ident.infer.planning import what_next
+from smp_motor_ident.infer.validation import simulate, split
 from smp_motor_ident.record import Record
 from smp_motor_ident.report import figures, history, summary, words
 from smp_motor_ident.report.document import (
@@ -39,15 +40,15 @@ if TYPE_CHECKING:
     from smp_motor_ident.report.tuning_page import Tuning
     from smp_motor_ident.tune import Loop
 
-COMPILED = Path(likelihood.__file__).parent / "__pycache__"
-"""Where numba keeps what it has compiled, unless NUMBA_CACHE_DIR says otherwise."""
+COMPILED = Path(simulation.__file__).parent / "__pycache__"
+"""Default folder of numba's compiled code."""
 
 OUTPUTS = ("identification.json", "motors.yaml", "report.html")
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """What came out for one wheel: an estimate with its curves, or the reason why there is none."""
+    """Result for one wheel: an estimate with its curves, or the reason for its absence."""
 
     estimate: Estimate | None = None
     comparisons: tuple[figures.Comparison, ...] = ()
@@ -56,20 +57,20 @@ class Outcome:
 
     @property
     def exit_code(self) -> int:
-        """0 where there is an estimate and it is reliable."""
+        """Exit code: 0 for a reliable estimate."""
         if self.failure is not None:
             return self.failure.exit_code
         return int(self.estimate is not None and self.estimate.unreliable)
 
 
 def work(arguments: argparse.Namespace) -> int:
-    """Do what the arguments say."""
+    """Run the command and return its exit code."""
     if arguments.topics:
         return tables.list_topics(arguments.bags, arguments.msg, NAME)
     loop = None if arguments.controller is None else reconstruction(arguments)
     mapping = signal_map(arguments) if loop is None else setpoint_map(arguments)
     if not arguments.output:
-        raise ParameterError("--output DIR is missing: where shall the results go?")
+        raise ParameterError("--output DIR is missing; give a folder for the results")
     fixed = fixed_parameters(arguments.fix)
     if arguments.fleet:
         if loop is not None or arguments.validate:
@@ -129,7 +130,7 @@ def _numbers(items: Sequence[str], option: str, known: Mapping[str, object]) -> 
 
 
 def signal_map(arguments: argparse.Namespace) -> bag.SignalMap | None:
-    """Return the mapping that the arguments ask for."""
+    """Return the mapping in the arguments."""
     if arguments.map and arguments.mapping:
         raise ParameterError("--map and --mapping exclude each other; write all into the file")
     if arguments.mapping:
@@ -143,7 +144,7 @@ def signal_map(arguments: argparse.Namespace) -> bag.SignalMap | None:
 def _read(
     paths: Sequence[str], mapping: bag.SignalMap | None, wheels: Sequence[str]
 ) -> dict[str, list[Record]]:
-    """Read the wheels that are asked for, or all."""
+    """Read the requested wheels, or all."""
     found = bag.read_experiments(list(paths), mapping)
     for wheel in wheels:
         if wheel not in found:
@@ -168,7 +169,7 @@ def identify_wheel(
     except np.linalg.LinAlgError as error:
         # One wheel's numerics must not take the others' results with them.
         text = (
-            f"{records[0].source}: {records[0].wheel}: the estimate broke down ({error}); "
+            f"{records[0].source}: {records[0].wheel}: the estimation failed ({error}); "
             "record a longer excitation with several frequencies, in both directions"
         )
         return Outcome(failure=InsufficientExcitationError(text))
@@ -247,7 +248,7 @@ def _contents(
 def _conclude(
     outcomes: Mapping[str, Outcome], paths: Sequence[Path], arguments: argparse.Namespace
 ) -> int:
-    """Print what came out; return the exit code."""
+    """Print the results; return the exit code."""
     estimates = {wheel: one.estimate for wheel, one in outcomes.items() if one.estimate}
     if not arguments.quiet and estimates:
         out = tables.console()
@@ -288,12 +289,12 @@ Reconstruct = Callable[[Record], Record]
 
 
 def setpoint_map(arguments: argparse.Namespace) -> bag.SignalMap:
-    """Return the mapping, the set-point standing where a voltage does."""
+    """Return the mapping, with the set-point in place of the voltage."""
     items: list[str] = arguments.map
     if arguments.mapping or not any(_SETPOINT.search(item) for item in items):
         raise ParameterError(
-            "--controller needs --map setpoint=... velocity=...: what the loop was given, in its "
-            "own unit, and what it measured"
+            "--controller needs --map setpoint=... velocity=...: the loop's set-point, in its own "
+            "unit, and its measurement"
         )
     if any(re.search(r"(^|\s|\.)voltage=", item) for item in items):
         raise ParameterError("--controller goes without voltage=: it computes the voltage")
@@ -314,7 +315,7 @@ def setpoint_map(arguments: argparse.Namespace) -> bag.SignalMap:
 
 
 def reconstruction(arguments: argparse.Namespace) -> Reconstruct:
-    """Return what replaces set-points by the voltages of the loop that ran."""
+    """Return a function that replaces set-points by the voltages of the known loop."""
     from smp_motor_ident.tune.exports import FORMATS
     from smp_motor_ident.tune.known_loop import reconstruct
 

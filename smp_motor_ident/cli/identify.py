@@ -1,4 +1,5 @@
-"""``identify``: from recordings to motors, each number with its certainty."""
+# SPDX-License-Identifier: Apache-2.0
+"""``identify``: identify motors from recordings, each value with its uncertainty."""
 
 import argparse
 from functools import partial
@@ -39,27 +40,27 @@ def parser() -> Parser:
     add = made.add_argument
     add("bags", nargs="+", metavar="BAG", help="bag, folder of bags, or CSV file")
     add("--output", "-o", metavar="DIR", help="folder for the results")
-    add("--force", action="store_true", help="replace results that are there")
-    add("--validate", action="append", default=[], metavar="BAG", help="judge the model by this")
+    add("--force", action="store_true", help="replace existing results")
+    add("--validate", action="append", default=[], metavar="BAG", help="validate on this")
     add("--wheel", action="append", default=[], metavar="NAME", help="only this wheel")
     add("--model", default="auto", help="force a model instead of choosing one")
     add("--fix", action="append", default=[], metavar="NAME=VALUE", help="known parameter, in SI")
-    add("--accept-unreliable", action="store_true", help="end with 0 although numbers may be off")
+    add("--accept-unreliable", action="store_true", help="exit with 0 if values are unreliable")
     add("--map", action="extend", nargs="+", default=[], metavar="KEY=VALUE", help="see below")
-    add("--mapping", metavar="FILE", help="the same as YAML file")
+    add("--mapping", metavar="FILE", help="mapping in a YAML file")
     add("--msg", action="append", default=[], metavar="FILE", help=".msg file of an unknown type")
     add(
         "--controller", nargs="+", metavar=("FORMAT", "GAIN=VALUE"),
-        help="the recording has set-points (--map setpoint=...) instead of voltages: of this loop",
+        help="loop of a recording with set-points (--map setpoint=...) instead of voltages",
     )  # fmt: skip
-    add("--topics", action="store_true", help="list what the bag offers, suggest a mapping")
-    add("--fleet", action="store_true", help="each recording by itself, compared in one table")
-    add("--scheduler", metavar="ADDRESS", help="with --fleet: of a Dask cluster that works")
-    add("--history", metavar="FILE", help="draw what identifier has seen since, from its history")
+    add("--topics", action="store_true", help="list the bag's topics and suggest a mapping")
+    add("--fleet", action="store_true", help="identify each recording, compare in one table")
+    add("--scheduler", metavar="ADDRESS", help="with --fleet: Dask cluster to use")
+    add("--history", metavar="FILE", help="draw the history that identifier wrote")
     add("--tuning", action="store_true", help="add the tuning page to the report (takes longer)")
     add("--what-next", action="store_true", help="propose the next recording")
-    add("--accuracy", type=number(0, 1), default=0.01, help="wanted by --what-next; default 0.01")
-    add("--verbose", "-v", action="store_true", help="print every finding, notes too")
+    add("--accuracy", type=number(0, 1), default=0.01, help="target of --what-next; default 0.01")
+    add("--verbose", "-v", action="store_true", help="print all findings and notes")
     add("--quiet", "-q", action="store_true", help="print errors only")
     return made
 

@@ -1,4 +1,5 @@
-"""Ctrl-C that is not lost: remembered when it comes, raised again where a tool waits.
+# SPDX-License-Identifier: Apache-2.0
+"""Handle Ctrl-C reliably: store it when it comes, raise it again where a tool waits.
 
 Python drops an exception that a signal handler raises inside some callbacks, among them those
 around a fork; a tool that is just starting a process would then go on as if nobody had asked.
@@ -29,14 +30,14 @@ def interruptible() -> Iterator[None]:
 
 
 def check() -> None:
-    """Raise the interruption that was asked for, if Python has dropped it."""
+    """Raise a pending interruption that Python has dropped."""
     if _requested.is_set():
         raise KeyboardInterrupt
 
 
 @contextmanager
 def held() -> Iterator[None]:
-    """Let the block come to its end before an interruption is raised."""
+    """Delay interruptions until the end of the block."""
     _held.set()
     try:
         yield

@@ -1,4 +1,5 @@
-"""What a commissioning does, and how long it takes: the plan, drawn, and the time that is left."""
+# SPDX-License-Identifier: Apache-2.0
+"""Plan a commissioning: its steps, their durations and the remaining time, drawn as a table."""
 
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -9,12 +10,12 @@ import numpy as np
 
 from smp_motor_control.excitation import SIGNALS as SHAPES
 from smp_motor_ident.cli.steps import Excitation
-from smp_motor_ident.diagnosis.identifiability import what_next
-from smp_motor_ident.diagnosis.wheel_limits import WANTED_ACCURACY
+from smp_motor_ident.commission.wheel_limits import WANTED_ACCURACY
+from smp_motor_ident.infer.planning import what_next
 from smp_motor_ident.result import Estimate
 
 FITTED, HELD_OUT = "excitation", "validation"
-"""Folders of the recordings that motors are identified from, and that they are judged by."""
+"""Folders of the recordings for identification and for validation."""
 
 SIGNALS = (
     ("sine", 0.75, 1.0, FITTED),
@@ -22,7 +23,7 @@ SIGNALS = (
     ("fourier", 1.0, 1.0, FITTED),
     ("steps", 1.0, 0.5, HELD_OUT),
 )
-"""What moves the wheels: signal, shares of amplitude and duration, and whose recording."""
+"""Excitations: signal, shares of amplitude and duration, and their recording."""
 
 FURTHER = "further"  # name of the recording that an identification asks for
 # Parts after the recordings
@@ -49,7 +50,7 @@ class Recording:
 
     @property
     def part(self) -> str:
-        """Name of the part that this is of the whole way."""
+        """Name of the part in the schedule."""
         return f"exciting: {self.name}"
 
     def describe(self) -> str:
@@ -68,7 +69,7 @@ def recordings(amplitude: float, duration: float) -> list[Recording]:
 
 
 def further(estimates: Mapping[str, Estimate], amplitude: float) -> Recording | None:
-    """Return the recording that would tell what these estimates leave open; None where none would.
+    """Return the recording that would reduce the uncertainty of these estimates, or None.
 
     Open is what gains are designed from: parameters and combinations that the data give, known to
     less than the accuracy wanted.  Of several wheels the one that needs the longest decides.

@@ -1,4 +1,5 @@
-"""Starting the nodes as processes of their own, and leaving none of them behind."""
+# SPDX-License-Identifier: Apache-2.0
+"""Start nodes as separate processes, and stop all of them at the end."""
 
 import contextlib
 import fcntl
@@ -13,21 +14,21 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import IO, Any
 
-from smp_motor_control.entry import wrong_domain
+from smp_motor_control.entry import find_domain_problem
 from smp_motor_control.errors import SmpError
 from smp_motor_ident.cli import interruption, workers
 from smp_motor_ident.errors import ParameterError
 
 
 class ProcessError(SmpError):
-    """A node ended by itself, or does not do what it should."""
+    """A node ended by itself or does not respond."""
 
     exit_code = 1
 
 
 def connect(name: str, ros_arguments: Sequence[str] = ()) -> Any:
     """Return the client of a running robot, for a ``with`` block; imports ROS only now."""
-    if wrong := wrong_domain():
+    if wrong := find_domain_problem():
         raise ParameterError(wrong)
     try:
         from smp_motor_control.nodes.robot_client import RobotClient
@@ -80,11 +81,11 @@ def _port_is_free(port: int) -> bool:
 
 
 class Processes:
-    """A set of node processes that ends with the block that holds it, however that ends.
+    """A set of node processes that ends with its ``with`` block in any case.
 
     Each is the leader of its own process group, is asked to stop by SIGINT, then by SIGTERM,
-    then killed; the kernel sends it SIGTERM if this process dies without a word.  What it says is
-    in a ``NAME.log`` of its own.
+    then killed; the kernel sends it SIGTERM if this process dies.  Its output goes to its own
+    ``NAME.log``.
     """
 
     def __init__(self, logs: Path) -> None:
@@ -121,7 +122,7 @@ class Processes:
             )
 
     def check(self, but: str = "") -> None:
-        """Look whether all still run."""
+        """Check that all are still running."""
         interruption.check()
         for name, process in self._running.items():
             if name != but and process.poll() is not None:
@@ -149,7 +150,7 @@ class Processes:
         del self._running[name]
 
     def stop(self, *names: str) -> None:
-        """Stop processes together: politely, then firmly."""
+        """Stop processes together, by stronger signals in turn."""
         group = [self._running.pop(name) for name in names if name in self._running]
         for number, patience in ((signal.SIGINT, 5.0), (signal.SIGTERM, 2.0), (signal.SIGKILL, 5)):
             for process in group:
@@ -157,7 +158,7 @@ class Processes:
             if _ended(group, patience):
                 break
         for process in group:
-            _signal(process, signal.SIGKILL)  # what a node may have left in its group
+            _signal(process, signal.SIGKILL)  # children that a node left in its group
 
 
 def _command(node: str) -> list[str]:

@@ -1,4 +1,5 @@
-"""Findings of a commissioning: written after every step, with those that it stops at."""
+# SPDX-License-Identifier: Apache-2.0
+"""Store the findings of a commissioning after every step."""
 
 import contextlib
 import json
@@ -8,7 +9,7 @@ from typing import Any
 
 from smp_motor_control.errors import SmpError
 from smp_motor_ident.cli.processes import ProcessError
-from smp_motor_ident.diagnosis.wheel_test import Figures
+from smp_motor_ident.commission.wheel_test import Figures
 from smp_motor_ident.finding import Finding
 from smp_motor_ident.report import commissioning as page
 from smp_motor_ident.report.document import now, read_identification, write_together
@@ -25,7 +26,7 @@ SUMMARY = ("DC gain", "Time constant", "Static voltage", "p", "i", "d", "Settles
 
 
 class Protocol:
-    """Findings, figures and verdict in ``commissioning.json`` and a page, gone on with if there."""
+    """Findings, figures and verdict in ``commissioning.json`` and a page; resumed if present."""
 
     def __init__(self, folder: Path, accepted: Sequence[str] = ()) -> None:
         self._folder, self._accepted = folder, tuple(accepted)
@@ -38,7 +39,7 @@ class Protocol:
         self.document |= {"passed": None, "verdict": "It was cut off.", "accepted": [*accepted]}
 
     def begin(self, wheels: Sequence[str], asked: Mapping[str, Any]) -> None:
-        """Forget what was found before: the wheels move anew."""
+        """Clear earlier results before the wheels move again."""
         self.document |= {
             "wheels": list(wheels), "asked": asked, "findings": [], "changes": [],
             **dict.fromkeys(PARTS, False),
@@ -54,11 +55,11 @@ class Protocol:
         self.document |= done
 
     def checks(self, figures: Mapping[str, Figures], amplitude: float, speed: float) -> None:
-        """Note what the test of the wheels showed, as :class:`~.checking.Checked` has it."""
+        """Record the results of the wheel checks, see :class:`~.checking.Checked`."""
         self.document |= plain({"checks": figures, "amplitude": amplitude, "speed": speed})
 
     def changes(self, changes: Sequence[Change]) -> None:
-        """Note what a drive showed."""
+        """Record the responses of a drive."""
         self._changes = list(changes)
         self.document["changes"] = [
             dict(wheel=one.wheel, name=one.name, setpoint=one.setpoint)
@@ -77,7 +78,7 @@ class Protocol:
         return self.refused(step)
 
     def refused(self, step: str) -> list[Finding]:
-        """Return what a commissioning stops at of a step's findings."""
+        """Return the findings of a step that stop a commissioning."""
         return self._noted(
             lambda f: (
                 f["step"] == step and f["severity"] == "refused" and f["code"] not in self._accepted
@@ -85,7 +86,7 @@ class Protocol:
         )
 
     def warned_of(self, wheels: Container[object]) -> list[Finding]:
-        """Return what earlier steps warned of these wheels: it may be the reason."""
+        """Return earlier warnings on these wheels, as possible reasons."""
         return self._noted(
             lambda f: f["severity"] == "warning" and f["evidence"].get("wheel") in wheels
         )
@@ -98,7 +99,7 @@ class Protocol:
         ]
 
     def stop(self, findings: Sequence[Finding]) -> None:
-        """Write the verdict and raise, where there is something to stop at."""
+        """Write the verdict and raise, if a finding stops the commissioning."""
         if findings:
             what = "; ".join(dict.fromkeys(f.message for f in findings))
             advice = "; ".join(dict.fromkeys(f.advice for f in findings if f.advice))
@@ -107,7 +108,7 @@ class Protocol:
 
     @contextlib.contextmanager
     def ending(self) -> Iterator[None]:
-        """Let whatever ends the block otherwise than at a finding stand in the protocol."""
+        """Record an error or interruption that ends the block."""
         try:
             yield
         except SmpError as error:
@@ -128,7 +129,7 @@ class Protocol:
         write_together(files, force=True)
 
     def results(self) -> page.Results:
-        """Return drive, gains and motors as far as they are known."""
+        """Return the drive, gains and motors found so far."""
         if not self.has("identified"):
             return {}
         read = read_identification(self._folder / "identification")
@@ -139,7 +140,7 @@ class Protocol:
         return page.results(estimates, gains, self.document["changes"])
 
     def summary(self) -> Iterator[str]:
-        """Return what a reader wants first, in a line for each wheel."""
+        """Yield the main results, one line per wheel."""
         rows = [row for group in self.results().values() for row in group if row.name in SUMMARY]
         for k, wheel in enumerate(self.document["wheels"]):
             told = (f"{row.name} {row.cells[k]} {row.unit}" for row in rows)

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """tune --relay: gains of one running wheel from a bounded oscillation, without a model."""
 
 import argparse
@@ -9,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from smp_motor_control.arrays import Array
-from smp_motor_control.parameter_file import written
+from smp_motor_control.parameter_file import format_parameters
 from smp_motor_ident.cli.processes import connect
 from smp_motor_ident.errors import DesignError, ParameterError
 from smp_motor_ident.report.document import check_free, write_together
@@ -60,7 +61,7 @@ def tune_by_relay(arguments: argparse.Namespace, files: Sequence[Path]) -> int:
             "antiwindup_strategy": "back_calculation",
         }  # fmt: skip
         head = [f"Tuned by relay feedback. {line}"]
-        text = written({f"/**/{wheel}/wheel_pid": parameters}, head)
+        text = format_parameters({f"/**/{wheel}/wheel_pid": parameters}, head)
         write_together({files[0]: text}, arguments.force)
         print(f"written: {files[0]}")
     return 0

@@ -1,4 +1,5 @@
-"""The way from a standing robot to tuned wheels, step by step: shared by demo and commission."""
+# SPDX-License-Identifier: Apache-2.0
+"""Steps from a running robot to tuned wheels, shared by demo and commission."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -24,7 +25,7 @@ class Excitation:
 
 @dataclass(frozen=True)
 class Robot:
-    """A robot whose nodes run, where its results go, and what it may reach meanwhile."""
+    """A robot with running nodes, the folder of its results, and its limits."""
 
     processes: Processes
     client: Any
@@ -49,7 +50,7 @@ class Robot:
             given = [*place, *self.ros_arguments]
             self.processes.start(f"{wheel}.wheel_pid", "wheel_pid", *given, priority=1)
         nodes = [controller_of(wheel) for wheel in wheels]
-        self.client.wait_for_nodes(nodes, PATIENCE)
+        self.client.wait_for_nodes(nodes, TIMEOUT_S)
         self.client.change_states(nodes, "configure")
 
     def stop_controllers(self, wheels: Sequence[str]) -> None:
@@ -57,22 +58,22 @@ class Robot:
         self.processes.stop(*(f"{wheel}.wheel_pid" for wheel in wheels))
 
     def switch(self, transition: str) -> None:
-        """Let every wheel's controller go through a lifecycle transition."""
+        """Apply a lifecycle transition to every wheel's controller."""
         self.client.change_states(self.wheel_nodes(), transition)
 
 
-PATIENCE = 60.0  # how long a busy machine may take to start or end a process [s]
+TIMEOUT_S = 60.0  # how long a busy machine may take to start or end a process [s]
 TOPICS = "/(.*/)?(motor_.*|pid_state|wheel_setpoints|cmd_vel|odom|joint_states|diagnostics)"
 """Topics of a robot that ``record`` keeps."""
 
 
 def record(robot: Robot, name: str, *shown: str) -> Path:
-    """Begin to record; return when the motors, and what else a wheel shows, are listened to."""
+    """Start to record; return once all topics of the wheels are subscribed."""
     bag = robot.folder / name
     arguments = ("--output", str(bag), "--regex", TOPICS, *robot.ros_arguments)
     robot.processes.start("record", "record", *arguments)
     topics = [f"{wheel}/{topic}" for wheel in robot.wheels for topic in ("motor_state", *shown)]
-    robot.client.wait_for_listener("record", topics, timeout=PATIENCE)
+    robot.client.wait_for_listener("record", topics, timeout=TIMEOUT_S)
     return bag
 
 
@@ -87,7 +88,7 @@ def excite(robot: Robot, plan: Sequence[Excitation]) -> None:
             parameters["lowest"], parameters["highest"] = part.band
         arguments = [a for n, v in parameters.items() for a in ("-p", f"{n}:={v}")]
         robot.processes.start("excite", "excite", *robot.ros_arguments, "--ros-args", *arguments)
-        robot.processes.wait("excite", part.duration + PATIENCE)
+        robot.processes.wait("excite", part.duration + TIMEOUT_S)
 
 
 def identify_wheels(bag: Path, output: Path, *options: str) -> dict[str, Estimate]:

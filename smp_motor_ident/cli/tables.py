@@ -1,4 +1,5 @@
-"""What tools print: results as tables, for a terminal, a pipe or a log, and what a bag offers."""
+# SPDX-License-Identifier: Apache-2.0
+"""Print results and a bag's topics as tables, for a terminal, a pipe or a log."""
 
 import shlex
 import sys
@@ -14,13 +15,13 @@ from smp_motor_ident.cli.frame import progress
 from smp_motor_ident.report import summary, words
 from smp_motor_ident.result import Estimate
 
-MOST_FIELDS = 12  # so many fields of a topic are printed
+MAX_FIELDS = 12  # largest number of printed fields per topic
 WIDE = 110  # columns of a terminal that has room for 95 % intervals
 _COLOR = {"good": "green", "fair": "yellow", "poor": "red"}
 
 
 def console() -> Console:
-    """Return the console of standard output; wide enough for a table when it is no terminal."""
+    """Return the console of standard output, wide enough for a table if not a terminal."""
     return Console(width=None if sys.stdout.isatty() else 140, highlight=False, markup=False)
 
 
@@ -34,7 +35,7 @@ def table(title: str, *columns: str) -> Table:
 
 
 def print_estimate(out: Console, estimate: Estimate, verbose: bool = False) -> None:
-    """Print one motor as the report has it: verdict, numbers, and the gravest messages, or all."""
+    """Print one motor like the report: verdict, numbers, and the gravest messages, or all."""
     grade, verdict = summary.judge(estimate)
     title = f"{words.label(estimate.wheel)}: {words.model(estimate.model)}"
     out.print(title, style="bold", soft_wrap=True)
@@ -50,7 +51,7 @@ def print_estimate(out: Console, estimate: Estimate, verbose: bool = False) -> N
 
 
 def _values(estimate: Estimate, intervals: bool) -> Table:
-    """Return the numbers and ranges that are known of a motor."""
+    """Return the known numbers and ranges of a motor."""
     held = {**estimate.combinations, **estimate.parameters}
     doubted = summary.find_doubted(estimate)
     made = table("", "quantity", "value", *(["95 % interval"] if intervals else []), "systematic")
@@ -76,15 +77,14 @@ def _values(estimate: Estimate, intervals: bool) -> Table:
 
 
 _WHAT_TO_MAP = (
-    "where one of the above is, say which: --map voltage=… velocity=… (or position=…, count=…); "
-    "where it is in another file, give both: voltage=/FILE.COLUMN; a level that no column holds is "
-    "voltage=COLUMN*0+VOLTS; without a voltage or a command none can be identified; see "
-    "docs/mapping.md"
+    "map the columns above: --map voltage=… velocity=… (or position=…, count=…); with several "
+    "files: voltage=/FILE.COLUMN; a constant voltage: voltage=COLUMN*0+VOLTS. Without a voltage or "
+    "a command no motor can be identified; see docs/mapping.md"
 )
 
 
 def list_topics(paths: Sequence[str], msg_files: Sequence[str], program: str) -> int:
-    """Print what recordings offer, and a mapping that may fit."""
+    """Print the topics of recordings, and a suggested mapping."""
     out = console()
     with progress(program) as say:
         say("reading")
@@ -110,8 +110,8 @@ def list_topics(paths: Sequence[str], msg_files: Sequence[str], program: str) ->
 
 
 def _print_offer(out: Console, offer: bag.Offer) -> None:
-    fields = ", ".join(offer.fields[:MOST_FIELDS])
-    if len(offer.fields) > MOST_FIELDS:
+    fields = ", ".join(offer.fields[:MAX_FIELDS])
+    if len(offer.fields) > MAX_FIELDS:
         fields += f", ... ({len(offer.fields)} fields)"
     indent = ""
     if offer.table and offer.count:

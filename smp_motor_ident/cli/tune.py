@@ -1,4 +1,5 @@
-"""``tune``: identification.json (or motors.yaml) in, gains for wheel nodes or other loops out."""
+# SPDX-License-Identifier: Apache-2.0
+"""``tune``: design gains from identification.json or motors.yaml for wheel nodes or other loops."""
 
 from functools import partial
 from pathlib import Path
@@ -29,7 +30,7 @@ AIMS: dict[str, dict[str, Any]] = {
     "transition_time": dict(type=float, help="of a change of set-point [s]"),
     "rule": dict(choices=("tyreus_luyben", "ziegler_nichols"), help="of --relay"),
 }
-"""Arguments that say what to aim at, each a target of the design."""
+"""Arguments for the targets of the design."""
 
 LOOP: dict[str, dict[str, Any]] = {
     "rate": dict(type=float, help="steps per second [Hz]; else that of the bag"),
@@ -38,16 +39,16 @@ LOOP: dict[str, dict[str, Any]] = {
         type=Path,
         help="measure both delays: a bag with motor_state and motor_command of the driving wheels",
     ),
-    "usual_delay": dict(type=float, help="what it usually is [s]; else --delay"),
+    "usual_delay": dict(type=float, help="usual delay [s]; default: --delay"),
     "speed_source": dict(
         choices=("auto", *SPEED_SOURCES), default="auto",
-        help="auto compares what each allows, and says why",
+        help="auto compares the gains that each allows",
     ),
     "difference_window": dict(type=int, help="[samples]; else as identified"),
     "speed_noise": dict(type=float, help="of the reported speed, standard deviation "
                         "[rad/s, motor]; else as identified"),
-    "angle_noise": dict(type=float, help="of the angle that the speed is made from, except of "
-                        "counts, standard deviation [rad, motor]; else as identified"),
+    "angle_noise": dict(type=float, help="of an angle (not counts) whose difference is the speed, "
+                        "standard deviation [rad, motor]; else as identified"),
     "gear_ratio": dict(type=float, help="else as identified"),
     "counts_per_revolution": dict(type=float, help="else as identified"),
     "supply": dict(type=float, help="[V]; else as identified"),
@@ -56,23 +57,23 @@ LOOP: dict[str, dict[str, Any]] = {
 RUNNING: dict[str, dict[str, Any]] = {
     "apply": dict(
         action="store_true",
-        help="set the gains in the running wheels, watch, take them back if a loop misbehaves",
+        help="set the gains in the running wheels, and restore the old ones if a loop misbehaves",
     ),
     "gains": dict(type=Path, help="with --apply and without a source: gains of this file"),
     "watch": dict(type=float, default=3.0, help="trial after --apply [s]"),
-    "relay": dict(metavar="WHEEL", help="make it oscillate, and tune from that, without a model"),
+    "relay": dict(metavar="WHEEL", help="tune by relay feedback, without a model"),
     "relay_amplitude": dict(type=float, help="[V]; a quarter of the supply"),
     "relay_hysteresis": dict(type=float, default=0.05, help="[rad/s, wheel]"),
     "relay_seconds": dict(type=float, default=4.0),
 }
-GROUPS = {"the loop that will run": LOOP, "what to aim at": AIMS, "wheels that run": RUNNING}
+GROUPS = {"the loop": LOOP, "targets": AIMS, "running wheels": RUNNING}
 
 TARGETS = (*AIMS, "relay_amplitude", "accept_unreliable")
 
 
 def parser() -> frame.Parser:
     """Return the parser of the tool's arguments."""
-    about = "Design gains that hold on the loop that will run."
+    about = "Design gains that keep their margins on the loop that will run."
     p = frame.Parser(prog="tune", description=about, epilog=frame.OF_ROS)
     add = p.add_argument
     add("source", type=Path, nargs="?", help="identification.json, its folder, or motors.yaml")
@@ -95,9 +96,9 @@ def parser() -> frame.Parser:
         help="one set of gains for all wheels, or one each")  # fmt: skip
     add(
         "--accept-unreliable", action="store_true", default=None,
-        help="design on an identification that calls itself unreliable, as wide as it leaves",
+        help="design on an unreliable identification, with its full uncertainty",
     )  # fmt: skip
-    add("--force", action="store_true", help="replace files that exist")
+    add("--force", action="store_true", help="replace existing files")
     for title, arguments in GROUPS.items():
         group = p.add_argument_group(title)
         for name, options in arguments.items():

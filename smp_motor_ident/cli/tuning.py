@@ -1,4 +1,5 @@
-"""What ``tune`` does: loops as the arguments describe them, designs, and what it tells of them."""
+# SPDX-License-Identifier: Apache-2.0
+"""Run ``tune``: build loops from the arguments, design gains, report them."""
 
 import argparse
 from collections import Counter
@@ -9,7 +10,7 @@ from typing import Any
 from smp_motor_control.errors import printable
 from smp_motor_control.motor.file import load_motors
 from smp_motor_control.motor.parameters import COMBINATIONS
-from smp_motor_control.parameter_file import flat
+from smp_motor_control.parameter_file import flatten
 from smp_motor_ident.bag.transport import TransportDelay, measure_delay
 from smp_motor_ident.cli import applying, frame, relaying, tune
 from smp_motor_ident.errors import DesignError, ParameterError
@@ -26,11 +27,11 @@ from smp_motor_ident.tune.writing import gains_document, gains_yaml, parameters,
 
 DEFAULT_RATE = 200.0  # steps per second where neither the user nor the identification says [Hz]
 SOURCES, COMPARISON, DESIGN = 1.0, 3.0, 2.0
-"""What a wheel takes on one core [s]: comparing sources of speed, comparing methods, a design."""
+"""Time per wheel on one core [s]: comparing speed sources, comparing methods, one design."""
 
 
 def work(arguments: argparse.Namespace) -> int:
-    """Tune, export or apply, as the arguments ask; return the exit code."""
+    """Tune, export or apply, according to the arguments; return the exit code."""
     if arguments.relay is not None:
         return relaying.tune_by_relay(arguments, _files(arguments)[:1])
     if arguments.gains is not None:
@@ -51,7 +52,7 @@ def work(arguments: argparse.Namespace) -> int:
     if files:
         _write(files, wheels, estimates, arguments, reasons)
     if arguments.apply:
-        gains = {wheel: flat(parameters(design)) for wheel, design in wheels.designs.items()}
+        gains = {wheel: flatten(parameters(design)) for wheel, design in wheels.designs.items()}
         return applying.apply(gains, arguments)
     return 0
 
@@ -71,11 +72,11 @@ def loop_for(
     usual_time = estimate.sample_time or 1.0 / DEFAULT_RATE
     sample_time = usual_time if arguments.rate is None else 1.0 / arguments.rate
     window = arguments.difference_window
-    # Of a speed that was recorded what averaging there is was identified.
+    # The averaging of a recorded speed was identified.
     usual_window = int(arguments.speed_source == "difference" or not estimate.speed_noise)
     usual, longest = (None, None) if measured is None else measured.until_applied(sample_time)
     if arguments.delay is not None:
-        usual = None  # it is the longest, which nothing measured may pass
+        usual = None  # a given delay is an upper limit
     return Loop(
         sample_time=sample_time,
         delay=_first(arguments.delay, longest),
@@ -117,7 +118,7 @@ def _design(
         if arguments.compare:
             say(_taking("comparing the methods", COMPARISON, estimates))
             method = _compare(estimates, loops, targets)
-            known = (*METHODS[method].targets, *case.COMMON)
+            known = (*METHODS[method].targets, *case.COMMON_TARGETS)
             targets = {k: v for k, v in targets.items() if k in known}
         say(_taking("designing", DESIGN, estimates))
         wheels = design_wheels(
@@ -169,7 +170,7 @@ def choose_sources(
 
 
 def _export(arguments: argparse.Namespace) -> int:
-    """Write, or print, gains for a loop that others run."""
+    """Write or print gains for another loop."""
     target, output = FORMATS[arguments.export], arguments.output
     if arguments.apply or arguments.compare:
         raise ParameterError("--export goes without --apply and --compare")
@@ -193,7 +194,7 @@ def _export(arguments: argparse.Namespace) -> int:
 
 
 def _apply_file(arguments: argparse.Namespace) -> int:
-    """Set the gains of a file, as they are."""
+    """Set the gains of a file unchanged."""
     if arguments.source is not None or arguments.output is not None or not arguments.apply:
         raise ParameterError("--gains goes with --apply alone, without a source and --output")
     return applying.apply(applying.from_file(arguments.gains), arguments)
@@ -252,11 +253,11 @@ def _compare(
 def tell_delays(
     loops: Mapping[str, Loop], measured: Mapping[str, TransportDelay], arguments: argparse.Namespace
 ) -> list[str]:
-    """Return where the delays come from, in a line for each wheel, if a bag was to tell them."""
+    """Return the sources of delays measured from a bag, in a line for each wheel."""
     lines = []
     for wheel, loop in loops.items() if arguments.bag is not None else ():
         if wheel not in measured:
-            lines.append(f"{wheel}: {arguments.bag} tells no delay: taken as one sample")
+            lines.append(f"{wheel}: {arguments.bag} has no delay data; one sample is assumed")
             continue
         one = measured[wheel]
         lines.append(
@@ -288,7 +289,7 @@ def row(result: Design | DesignError) -> str:
 
 
 def show(wheels: WheelSet) -> None:
-    """Print the designs of all wheels, and why they are as they are."""
+    """Print the designs of all wheels, and the reasons for them."""
     print(f"  {'wheel':16s}{HEAD[18:]}")
     for wheel, design in wheels.designs.items():
         print(f"  {wheel:16s} {row(design)}")
@@ -303,7 +304,7 @@ def show(wheels: WheelSet) -> None:
 def provenance(
     wheels: WheelSet, arguments: argparse.Namespace, estimates: Mapping[str, Estimate], date: str
 ) -> list[str]:
-    """Return where gains come from, as lines for the head of their file."""
+    """Return the provenance of gains, as lines for the head of their file."""
     lines = [
         f"Gains of the wheel nodes, designed {date} by tune from {arguments.source}.",
         "Units: wheel rad/s, volts, seconds; model.* at the motor shaft.",

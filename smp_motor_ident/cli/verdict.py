@@ -1,4 +1,5 @@
-"""Results of the demo against the known truth: a table per wheel, and what must hold."""
+# SPDX-License-Identifier: Apache-2.0
+"""Compare the results of the demo with the truth: a table per wheel, and checks."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -12,10 +13,10 @@ from smp_motor_ident.report import words
 from smp_motor_ident.result import Estimate, Quantity
 from smp_motor_ident.tune.verification import Change
 
-MOST_OVERSHOOT = 2.0  # percent of the change
-MOST_LATE = 20.0  # ms later than predicted: four samples
-MOST_GAIN_ERROR = 0.5  # percent
-MOST_DEVIATIONS = 3.0  # of its own standard deviations, for every parameter of a wheel
+MAX_OVERSHOOT = 2.0  # percent of the change
+MAX_SETTLING_EXCESS = 20.0  # ms later than predicted: four samples
+MAX_GAIN_ERROR = 0.5  # percent
+MAX_DEVIATIONS = 3.0  # of its own standard deviations, for every parameter of a wheel
 WORST_DEVIATIONS = 4.0
 # Of 40 numbers, some 26 of them independent, one lies beyond 3 by chance in one run of 15
 # (and beyond 4 in one of 600): so one wheel may, and none may beyond 4.
@@ -27,7 +28,7 @@ GAINS = ("p", "i", "d", "feedforward_static", "feedforward_velocity", "feedforwa
 
 @dataclass(frozen=True)
 class Check:
-    """One thing that the demo must show: the worst figure, its limit, and where it occurred."""
+    """One check of the demo: the worst figure, its limit, and its place."""
 
     name: str
     worst: float
@@ -88,7 +89,7 @@ def show(
 def check_estimates(
     truth: Mapping[str, MotorEntry], estimates: Mapping[str, Estimate]
 ) -> list[Check]:
-    """Hold the identified motors against the limits."""
+    """Check the identified motors against the limits."""
     gain, deviation = [], []
     beyond = set()
     for wheel in estimates:
@@ -99,23 +100,23 @@ def check_estimates(
             if quantity.status == "estimated":
                 deviations = error / (quantity.std or 1e-300)
                 deviation.append((deviations, f"{wheel} {name}"))
-                if not deviations <= MOST_DEVIATIONS:
+                if not deviations <= MAX_DEVIATIONS:
                     beyond.add(wheel)
     return [
-        _worst("error of the DC gain", gain, MOST_GAIN_ERROR, "%"),
+        _worst("error of the DC gain", gain, MAX_GAIN_ERROR, "%"),
         _worst("error of a parameter", deviation, WORST_DEVIATIONS, "standard deviations"),
         Check("wheels with an error beyond 3", len(beyond), 1, ", ".join(beyond) or "-", "wheels"),
     ]
 
 
 def check_drive(changes: Mapping[str, Sequence[Change]]) -> list[Check]:
-    """Hold what the wheels did against the limits."""
+    """Check the wheels' responses against the limits."""
     every = [(f"{wheel} {one.name}", one) for wheel, given in changes.items() for one in given]
     over = [(one.reading.overshoot, where) for where, one in every]
     late = [(1e3 * (one.reading.settling - one.expected.settling), where) for where, one in every]
     return [
-        _worst("overshoot", over, MOST_OVERSHOOT, "%"),
-        _worst("settling after its prediction", late, MOST_LATE, "ms"),
+        _worst("overshoot", over, MAX_OVERSHOOT, "%"),
+        _worst("settling after its prediction", late, MAX_SETTLING_EXCESS, "ms"),
     ]
 
 

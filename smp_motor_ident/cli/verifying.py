@@ -1,4 +1,5 @@
-"""New gains on trial: a drive of all wheels, held against what the design predicted of it."""
+# SPDX-License-Identifier: Apache-2.0
+"""Verify new gains: drive all wheels and compare their responses with the design's predictions."""
 
 import contextlib
 import shutil
@@ -18,34 +19,34 @@ from smp_motor_ident.tune import verification
 from smp_motor_ident.tune.verification import STEADY, Change
 
 LEAST = 1.0  # of a change of set-point with its end [s]
-ATTEMPTS = 3  # drives; a drive that was disturbed is repeated, whatever it showed
+ATTEMPTS = 3  # largest number of drives; a disturbed drive is repeated
 
 
 class NeverHeard(processes.ProcessError):
-    """A wheel's controller that was not heard at a set-point of the drive."""
+    """A wheel's controller published nothing at a set-point of the drive."""
 
 
 @dataclass
 class Trial:
-    """Gains on trial: ``kept`` says whether they stay when it ends."""
+    """Gains on trial; ``kept`` tells whether they stay after it."""
 
     kept: bool = False
 
 
 @contextlib.contextmanager
 def on_trial(client: Any, gains: Mapping[str, Mapping[str, Any]]) -> Iterator[Trial]:
-    """Set gains in the running controllers; set the former ones again unless they are kept."""
+    """Set gains in the running controllers; restore the old ones unless they are kept."""
     new = {controller_of(wheel): dict(values) for wheel, values in gains.items()}
     old = client.get_parameters({node: list(values) for node, values in new.items()})
-    owed, trial = dict(client.owed), Trial()
-    client.owe(**owed, gains=old)
+    pending_restore, trial = dict(client.pending_restore), Trial()
+    client.set_pending_restore(**pending_restore, gains=old)
     client.set_parameters(new)
     try:
         yield trial
     finally:
         if not trial.kept:
             client.set_parameters(old)
-        client.owe(**owed)
+        client.set_pending_restore(**pending_restore)
 
 
 def plan_of(designed: Designed) -> list[tuple[str, float, float]]:
@@ -77,7 +78,7 @@ def drive(robot: steps.Robot, plan: Sequence[tuple[str, float, float]]) -> Path:
 def drive_undisturbed(
     robot: steps.Robot, designed: Designed, say: Callable[[str], None]
 ) -> tuple[list[Change], list[Finding]]:
-    """Drive until the computer did not disturb it; return the changes and the findings."""
+    """Repeat a drive until it is undisturbed; return the changes and the findings."""
     plan, namespace = plan_of(designed), str(robot.client.node.get_namespace()).rstrip("/")
     for left in reversed(range(ATTEMPTS)):
         say(f"driving on the new gains: {', '.join(name for name, *_ in plan)}")
@@ -114,11 +115,11 @@ def read_changes(
 
 
 def _begin(wheel: str, setpoint: float, answers: Table) -> float:
-    """Return when a wheel was first heard at a set-point."""
+    """Return the time of a wheel's first message at a set-point."""
     asked = np.flatnonzero(np.isclose(answers.columns["setpoint"], setpoint))
     if not asked.size:
         raise NeverHeard(
-            f"{wheel}: wheel_pid was never heard at {setpoint:.3g} rad/s in the drive: it was at "
-            "fault, or its messages were lost; look at /diagnostics, then go on with --resume"
+            f"{wheel}: wheel_pid published nothing at {setpoint:.3g} rad/s in the drive: it had a "
+            "fault, or its messages were lost; check /diagnostics, then continue with --resume"
         )
     return float(answers.seconds[asked[0]])

@@ -1,4 +1,5 @@
-"""Independent pieces of work side by side, in as many processes as there are cores."""
+# SPDX-License-Identifier: Apache-2.0
+"""Run independent jobs in parallel, in as many processes as there are cores."""
 
 import ctypes
 import multiprocessing
@@ -21,7 +22,7 @@ _JOBS: dict[str, Callable[[Say], Any]] = {}
 def in_parallel(
     jobs: Mapping[str, Callable[[Say], Result]], say: Say, doing: str = "estimating"
 ) -> dict[str, Result]:
-    """Do every job, each in a process that is forked and so has what is loaded already."""
+    """Run every job in a forked process, which shares the loaded modules."""
     cores = min(len(os.sched_getaffinity(0)), len(jobs))
     if cores < 2:
         return {n: job(lambda text, n=n: say(f"{n}: {text}")) for n, job in jobs.items()}

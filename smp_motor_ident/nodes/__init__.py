@@ -1,1 +1,2 @@
-"""Nodes that need what is known of motors: record, play, identifier."""
+# SPDX-License-Identifier: Apache-2.0
+"""Nodes that use identification: record, play, identifier."""

@@ -1,4 +1,5 @@
-"""What `record` and `play` share: a choice of topics, message classes by name, QoS."""
+# SPDX-License-Identifier: Apache-2.0
+"""Shared code of `record` and `play`: choice of topics, message classes by name, QoS."""
 
 import argparse
 import importlib
@@ -24,7 +25,7 @@ def message_class(type_name: str) -> Any | None:
 
 
 def quality(depth: int, reliable: bool, latched: bool) -> QoSProfile:
-    """Return the QoS of messages that are taken, or sent again, as they came."""
+    """Return the QoS for taking raw messages, or sending them again."""
     return QoSProfile(
         depth=depth,
         reliability=ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT,
@@ -62,4 +63,4 @@ def _pattern(option: str, text: str) -> re.Pattern[str] | None:
     try:
         return re.compile(text) if text else None
     except re.error as error:
-        raise SmpError(f"{option} {text!r} is no regular expression: {error}") from None
+        raise SmpError(f"{option} {text!r} is not a regular expression: {error}") from None

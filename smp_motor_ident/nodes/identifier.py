@@ -1,14 +1,15 @@
+# SPDX-License-Identifier: Apache-2.0
 """``identifier``: estimates the motors while they run.
 
-Keeps a window of every wheel's ``motor_state``, estimates from it in a thread beside the
-callbacks, and publishes ``MotorParameters``.  Before a window has seen enough (time, motion,
-levels and changes of voltage, both directions) the message has no numbers and its ``status``
-begins with ``collecting`` and says what is missing; else it begins with ``valid`` or, with the
-reason, ``unreliable``, or ``refused`` with the reason.
+Keeps a window of every wheel's ``motor_state``, estimates from it in a separate thread, and
+publishes ``MotorParameters``.  While a window lacks excitation (time, motion, levels and
+changes of voltage, both directions) the message has no numbers and its ``status`` begins with
+``collecting`` and lists the missing excitation; else it begins with ``valid``, or with
+``unreliable`` or ``refused`` and the reason.
 
-With ``commissioned`` it follows resistance, motor constant and friction of the motors of an
-identification besides, warns on ``/diagnostics`` when one has left its band and why, and adds a
-line a wheel to ``history`` every minute, which ``identify --history`` draws.  It changes no gains.
+With ``commissioned`` it also tracks resistance, motor constant and friction of identified motors,
+warns on ``/diagnostics`` when one has left its band, with the reason, and appends a line per wheel
+to ``history`` every minute, which ``identify --history`` draws.  It changes no gains.
 """
 
 import math
@@ -30,19 +31,19 @@ from smp_motor_control.encoder import wrap
 from smp_motor_control.errors import ParameterError, SmpError
 from smp_motor_control.fields import described, fixed, nested
 from smp_motor_control.nodes import executor, runtime
-from smp_motor_control.nodes.publishers import PublisherWatch, two_publishers
+from smp_motor_control.nodes.publishers import PublisherWatch, describe_two_publishers
 from smp_motor_control.nodes.settings import Parameters
 from smp_motor_ident.bag import read
 from smp_motor_ident.bag.window import Window
 from smp_motor_ident.estimate import estimate
-from smp_motor_ident.estimation.live import Demands, missing
-from smp_motor_ident.estimation.monitor import Monitor, commissioned_of
+from smp_motor_ident.live.demands import Demands, missing
+from smp_motor_ident.live.monitor import Monitor, commissioned_of
 from smp_motor_ident.record import Record
 from smp_motor_ident.report import document, history
 from smp_motor_ident.result import Estimate
 
-UNHURRIED = QoSProfile(depth=1000, reliability=ReliabilityPolicy.BEST_EFFORT)
-"""On a busy machine samples wait for the node: a lost one leaves the fit a guessed voltage."""
+QUEUE_DEPTH = QoSProfile(depth=1000, reliability=ReliabilityPolicy.BEST_EFFORT)
+"""Depth of the queue, since samples wait on a busy machine and a lost one harms the fit."""
 
 TAKE_PERIOD = 0.05
 """Between two batches of samples [s]: waking up for each would cost half as much again."""
@@ -53,13 +54,15 @@ MINUTE = 60.0  # between two lines of a history [s]
 @dataclass(frozen=True, kw_only=True)
 class Settings:
     wheels: tuple[str, ...] = fixed(WHEELS, "Wheels to identify.")
-    window: float = fixed(60.0, "How much of the past is used [s].", minimum=2.0, maximum=600.0)
-    period: float = fixed(5.0, "Least interval between two estimates of a wheel [s].", minimum=0.5)
+    window: float = fixed(60.0, "Length of the window of samples [s].", minimum=2.0, maximum=600.0)
+    period: float = fixed(
+        5.0, "Minimum interval between two estimates of a wheel [s].", minimum=0.5
+    )
     share: float = described(
         0.03, "Largest share of a processor for estimates in the long run [1].",
         minimum=1e-3, maximum=1.0,
     )  # fmt: skip
-    model: str = described("auto", "Model to fit; auto chooses the simplest that holds.")
+    model: str = described("auto", "Model to fit; auto chooses the simplest adequate one.")
     commissioned: str = fixed("", "identification.json, or its folder, of the motors to watch.")
     history: str = fixed("", "File to which the history of the motors is appended.")
     demands: Demands = nested(Demands(), prefix="demands.")
@@ -75,7 +78,7 @@ class Settings:
 
 
 class Wheel:
-    """One wheel's window, topics and last answer."""
+    """One wheel's window, topics and last estimate."""
 
     def __init__(self, node: Node, name: str, length: float, monitor: Monitor | None) -> None:
         self.window = Window(name, length)
@@ -95,13 +98,13 @@ class Wheel:
         )
         topic = f"{name}/motor_state"
         self._states = node.create_subscription(
-            MotorState, topic, self._on_state, UNHURRIED, callback_group=executor.Untouched()
+            MotorState, topic, self._on_state, QUEUE_DEPTH, callback_group=executor.OwnerReads()
         )
         topic = f"{name}/motor_description"
         node.create_subscription(MotorDescription, topic, self._on_description, runtime.LATCHED)
 
     def take(self) -> None:
-        """Take all samples that wait."""
+        """Take all pending samples."""
         handle = self._states.handle
         with handle:
             while (taken := handle.take_message(MotorState, False)) is not None:
@@ -112,7 +115,7 @@ class Wheel:
         nanoseconds = runtime.nanoseconds(stamp)
         self.unstamped = not nanoseconds
         self.watch.hear(info)
-        if self.watch.doubled or self.unstamped:
+        if self.watch.has_two_publishers or self.unstamped:
             return  # of two wheels, or of no instant
         if self.monitor is not None:
             turned = self._turned(message.encoder_count, message.position)
@@ -120,7 +123,7 @@ class Wheel:
         self.window.add(nanoseconds, message, info["publication_sequence_number"] or 0)
 
     def _turned(self, count: int, position: float) -> float:
-        """Return the motor's angle since the sample before [rad]; NaN where it is not known."""
+        """Return the motor's angle since the previous sample [rad]; NaN if unknown."""
         hardware = self.window.hardware
         before, self._count = self._count, count
         angle, self._position = self._position, position
@@ -179,10 +182,10 @@ class Identifier(Node):
             wheel.take()
 
     def _begin(self) -> None:
-        """Hand every window that shows enough to the worker; say what the others lack.
+        """Hand every window with enough excitation to the worker; report the others' lack.
 
-        Estimates are followed by a pause in proportion to what they cost.  What came last before
-        samples ceased to come does not wait for its end.
+        A pause in proportion to its cost follows every estimate; the last window before samples
+        stop arriving skips the pause.
         """
         settings, now = self._given.settings, time.monotonic()
         for wheel in self._wheels.values():
@@ -202,12 +205,12 @@ class Identifier(Node):
                 wheel.running = self._worker.submit(partial(_identify, record, settings.model))
 
     def _check_source(self, wheel: Wheel) -> None:
-        """Refuse samples of two publishers, and such without a stamp."""
+        """Refuse samples of two publishers, and samples without a stamp."""
         topic = f"{wheel.window.wheel}/motor_state"
-        if wheel.watch.doubled:
-            raise SmpError(two_publishers(self, topic))
+        if wheel.watch.has_two_publishers:
+            raise SmpError(describe_two_publishers(self, topic))
         if wheel.unstamped:
-            raise SmpError(f"{topic} has no stamp; its driver must fill in the instant of sampling")
+            raise SmpError(f"{topic} has no stamp; its driver must set the time of sampling")
 
     def _publish_finished(self) -> None:
         for wheel in self._wheels.values():
@@ -232,9 +235,15 @@ class Identifier(Node):
         valid = sum(wheel.status.startswith("valid") for wheel in self._wheels.values())
         level = runtime.OK if valid == len(states) else runtime.WARN
         message = f"{valid} of {len(states)} wheels identified"
-        doubled = [f"{n}/motor_state" for n, w in self._wheels.items() if w.watch.doubled]
+        doubled = [
+            f"{n}/motor_state" for n, w in self._wheels.items() if w.watch.has_two_publishers
+        ]
         if doubled:
-            return runtime.ERROR, "; ".join(two_publishers(self, one) for one in doubled), states
+            return (
+                runtime.ERROR,
+                "; ".join(describe_two_publishers(self, one) for one in doubled),
+                states,
+            )
         watched = {n: w.monitor for n, w in self._wheels.items() if w.monitor is not None}
         if watched:  # then a wheel that has nothing to say of itself is no warning
             level, message = runtime.OK, f"{len(watched)} wheels watched; {message}"
@@ -251,7 +260,7 @@ class Identifier(Node):
         return level, message, states
 
     def _add_history(self) -> None:
-        """Add a line of every watched wheel that is known by now."""
+        """Append a line for every watched wheel with estimates."""
         entries = [
             history.entry_of(runtime.seconds(wheel.stamp), name, wheel.monitor)
             for name, wheel in self._wheels.items()
@@ -263,7 +272,7 @@ class Identifier(Node):
             self.get_logger().error(f"{self._given.settings.history}: {error.strerror}")
 
     def on_stop(self) -> None:
-        """Do not wait for an estimate that nobody will hear of."""
+        """Stop without waiting for a running estimate."""
         self._worker.shutdown(wait=False, cancel_futures=True)
 
 
@@ -271,14 +280,16 @@ def _monitors(settings: Settings) -> dict[str, Monitor]:
     """Return a monitor of every wheel that was commissioned; refuse one that cannot be watched."""
     if not settings.commissioned:
         if settings.history:
-            raise ParameterError("history needs commissioned: whose history shall it be?")
+            raise ParameterError(
+                "history needs commissioned; give the identification of the motors"
+            )
         return {}
     found = document.read_identification(Path(settings.commissioned))
     return {n: Monitor(commissioned_of(found[n])) for n in settings.wheels if n in found}
 
 
 def _identify(record: Record, model: str) -> tuple[Estimate | Exception, float]:
-    """Return what a window tells, or why nothing, and the processor time that it took [s]."""
+    """Return the estimate of a window, or its error, and the processor time it took [s]."""
     begun = time.thread_time()
     found: Estimate | Exception
     try:

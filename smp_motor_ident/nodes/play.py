@@ -1,4 +1,5 @@
-"""play: a bag's messages once more, byte for byte and in their own time."""
+# SPDX-License-Identifier: Apache-2.0
+"""play: publish a bag's messages again, byte for byte and at their times."""
 
 import argparse
 import sys
@@ -22,14 +23,16 @@ from smp_motor_ident.bag.storage import Channel
 from smp_motor_ident.nodes.bag_arguments import chosen, message_class, quality
 
 DEPTH = 1000
-FIND_EACH_OTHER = 1.0
+DISCOVERY_TIME_S = 1.0
 """Shortest wait [s] before the first message, so that subscribers find the publishers."""
-FIND_ANYBODY = 3.0  # longest wait [s] for a first subscriber, where nobody listens yet
-FIND_AT_MOST = 5.0  # longest wait [s] until everybody whom the graph shows is connected
+FIRST_SUBSCRIBER_TIMEOUT_S = (
+    3.0  # longest wait [s] for a first subscriber, where nobody listens yet
+)
+CONNECTION_TIMEOUT_S = 5.0  # longest wait [s] until everybody whom the graph shows is connected
 
 
 class Player(Node):
-    """Publishes the messages of a bag from a thread of its own."""
+    """Publisher of a bag's messages in a separate thread."""
 
     def __init__(
         self, replay: Replay, channels: list[Channel], options: argparse.Namespace
@@ -88,15 +91,15 @@ class Player(Node):
         runtime.finish(code)
 
     def _wait_for_subscribers(self) -> None:
-        """Wait until there is somebody, and everybody is connected, within limits."""
+        """Wait until there is a subscriber, and all are connected, within time limits."""
         begin = time.monotonic()
         while not self._ended.wait(0.02):
             waited = time.monotonic() - begin
             linked = [p.get_subscription_count() for _, p in self._outputs.values()]
             known = [self.count_subscribers(p.topic_name) for _, p in self._outputs.values()]
-            enough = FIND_ANYBODY if not any(known) else 0.0
+            enough = FIRST_SUBSCRIBER_TIMEOUT_S if not any(known) else 0.0
             if any(link < count for link, count in zip(linked, known)):
-                enough = FIND_AT_MOST
+                enough = CONNECTION_TIMEOUT_S
             if waited >= max(enough, self._options.delay):
                 return
 
@@ -148,7 +151,7 @@ class Player(Node):
         return False
 
     def on_stop(self) -> None:
-        """Stop the thread and tell what was sent."""
+        """Stop the thread and report the number of sent messages."""
         self._ended.set()
         self._thread.join(timeout=1.0)
         for finding in self._replay.findings:
@@ -173,7 +176,7 @@ def parser() -> argparse.ArgumentParser:
     add("--start-offset", type=float, default=0.0, metavar="S", help="begin so late in the bag")
     add("--loop", "-l", action="store_true", help="begin again at the end")
     add("--clock", nargs="?", type=float, const=40.0, default=0.0, metavar="HZ", help="send /clock")
-    add("--delay", type=float, default=FIND_EACH_OTHER, metavar="S", help="wait before the first")
+    add("--delay", type=float, default=DISCOVERY_TIME_S, metavar="S", help="wait before the first")
     return made
 
 

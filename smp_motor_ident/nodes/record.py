@@ -1,8 +1,9 @@
-"""record: any topics into a bag that is readable whenever the recorder dies.
+# SPDX-License-Identifier: Apache-2.0
+"""record: write any topics into a bag that stays readable whenever the recorder dies.
 
-Messages are taken raw, so that they stay byte for byte what was sent.  They are taken in
-small batches from DDS' own queue instead of one callback each: at 4 x 1 kHz that costs a
-third of the time, and the queue's reception stamps stay exact.
+Messages are taken raw and written byte for byte as sent.  They are taken in small batches from
+DDS' own queue instead of one callback each: at 4 x 1 kHz that costs a third of the time, and the
+queue's reception stamps stay exact.
 """
 
 import argparse
@@ -21,7 +22,11 @@ from rclpy.topic_endpoint_info import TopicEndpointInfo
 
 from smp_motor_control.errors import SmpError
 from smp_motor_control.nodes import executor, runtime
-from smp_motor_control.nodes.publishers import PublisherWatch, are_known, two_publishers
+from smp_motor_control.nodes.publishers import (
+    PublisherWatch,
+    are_publishers_known,
+    describe_two_publishers,
+)
 from smp_motor_control.ros_arguments import split_arguments
 from smp_motor_ident.bag import BagWriter
 from smp_motor_ident.bag.writer import DEFAULT_QOS
@@ -30,11 +35,11 @@ from smp_motor_ident.nodes.bag_arguments import Choice, chosen, message_class, q
 TAKE_PERIOD = 0.004
 LOOK_PERIOD = 0.05
 DEPTH = 2000
-"""Messages that DDS keeps for us per topic: two seconds of 1 kHz while the disk is busy."""
+"""Depth of the DDS queue per topic: two seconds of 1 kHz while the disk is busy."""
 
 
 ONE_PUBLISHER = ("smp_interfaces/msg/MotorState", "smp_interfaces/msg/PidState")
-"""What only one node can know; of other types several publishers may be meant."""
+"""Types with only one publisher per topic; others may have several."""
 
 
 @dataclass
@@ -68,7 +73,7 @@ def qos_document(qos: QoSProfile) -> dict[str, Any]:
 
 
 class Recorder(Node):
-    """Finds topics as they appear, and writes what comes on them, for ``duration`` [s] or ever."""
+    """Recorder of topics as they appear, for ``duration`` [s] or without end."""
 
     def __init__(self, writer: BagWriter, choice: Choice, duration: float = 0.0) -> None:
         super().__init__("record")
@@ -77,7 +82,7 @@ class Recorder(Node):
         self._choice = replace(choice, names=frozenset(own))
         self._topics: dict[str, Topic] = {}
         self._refused: set[str] = set()
-        self._group = executor.Untouched()
+        self._group = executor.OwnerReads()
         self._look()
         runtime.steady_timer(self, LOOK_PERIOD, self._look)
         runtime.steady_timer(self, TAKE_PERIOD, self._take_all)
@@ -86,7 +91,7 @@ class Recorder(Node):
         self.get_logger().info(f"recording to {writer.path}")
 
     def _look(self) -> None:
-        """Subscribe to what is new, and follow publishers that offer less than the others."""
+        """Subscribe to new topics, and match publishers with weaker QoS than the others."""
         for name, types in self.get_topic_names_and_types():
             if not self._choice.wants(name) or name in self._refused:
                 continue
@@ -125,7 +130,7 @@ class Recorder(Node):
         )
 
     def _adapt(self, name: str, topic: Topic, infos: list[TopicEndpointInfo]) -> None:
-        """Take less than before where a new publisher offers less, so that none is missed."""
+        """Reduce the requested QoS to that of a weaker new publisher."""
         topic.publishers, topic.last_number = len(infos), 0
         qos = subscription_qos([info.qos_profile for info in infos])
         old = topic.subscription.qos_profile
@@ -140,14 +145,14 @@ class Recorder(Node):
     def _take_all(self) -> None:
         for name, topic in self._topics.items():
             self._take(name, topic)
-            doubled = topic.type in ONE_PUBLISHER and topic.watch.doubled
-            if doubled and not topic.doubled and are_known(self, name):
+            doubled = topic.type in ONE_PUBLISHER and topic.watch.has_two_publishers
+            if doubled and not topic.doubled and are_publishers_known(self, name):
                 topic.doubled = True
-                self.get_logger().warning(two_publishers(self, name))
+                self.get_logger().warning(describe_two_publishers(self, name))
         self._writer.flush()
 
     def _take(self, name: str, topic: Topic) -> None:
-        """Write all that waits on a topic."""
+        """Write all pending messages of a topic."""
         handle, write = topic.subscription.handle, self._writer.write
         with handle:
             while (taken := handle.take_message(topic.subscription.msg_type, True)) is not None:
@@ -164,11 +169,11 @@ class Recorder(Node):
                 write(name, topic.type, data, received, sent=sent, number=number)
 
     def on_stop(self) -> None:
-        """Take what has come, close the bag and tell what is in it."""
+        """Take pending messages, close the bag and report its contents."""
         try:
             self._take_all()
             self._writer.close()
-        except SmpError as error:  # the disk is full: what is there is whole
+        except SmpError as error:  # the disk is full, but the bag is readable
             print(f"record: {error}", file=sys.stderr, flush=True)
         counts = self._writer.counts
         for name, count in sorted(counts.items()):
@@ -199,13 +204,13 @@ def parser() -> argparse.ArgumentParser:
 
 
 def _make_room(path: Path, force: bool) -> None:
-    """Remove a bag that is to be replaced; nothing else is ever removed."""
+    """Remove a bag to be replaced; refuse anything else."""
     if not path.exists():
         return
     if not force:
         raise SmpError(f"{path} exists already; choose another name or say --force")
     if not path.is_dir() or (any(path.iterdir()) and not (path / "metadata.yaml").exists()):
-        raise SmpError(f"{path} is no bag; --force replaces bags only")
+        raise SmpError(f"{path} is not a bag; --force replaces bags only")
     shutil.rmtree(path)
 
 

@@ -1,4 +1,5 @@
-"""A chart as data: what the page's script draws to zoom into, and what is drawn for print."""
+# SPDX-License-Identifier: Apache-2.0
+"""A chart as data, for the page's interactive script and for print."""
 
 import base64
 from dataclasses import dataclass
@@ -42,7 +43,7 @@ class Chart:
     group: str = ""  # charts of one group share cursor and zoom in x
     height: int = 220
     view: tuple[float, float] | None = None  # stretch of x that a screen shows at first
-    summary: str = ""  # what the chart shows, for those who cannot see it
+    summary: str = ""  # description of the chart for screen readers
 
 
 def packed(values: Array) -> str:

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The page of a commissioning: verdict, motors and gains, predicted and measured drive, checks."""
 
 from __future__ import annotations
@@ -172,7 +173,7 @@ def render(
         findings=[one for one in findings if one["severity"] != "note"],
         notes=[one for one in findings if one["severity"] == "note"],
         results=known,
-        # Their origin, in comments, stands in the file.
+        # Without the comments on their origin, which are in the file
         parameters="\n".join(x for x in parameters.splitlines() if not x.startswith("#")),
         checks=document.get("checks", {}),
         changes=document.get("changes", []),

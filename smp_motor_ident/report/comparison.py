@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Wheels side by side: each quantity's intervals on one axis, as shares of its length."""
 
 import math
@@ -12,7 +13,7 @@ COMPARED = (
     "dc_gain", "time_constant", "time_constant_product", "static_voltage", "delay", "resistance",
     "motor_constant",
 )  # fmt: skip
-"""What is drawn side by side, where it is known of a wheel."""
+"""Quantities compared between wheels, where known."""
 
 MARGIN = 0.06  # of the axis, beyond the intervals
 
@@ -40,7 +41,7 @@ class Compared:
 
 
 def compare(estimates: Mapping[str, Estimate]) -> list[Compared]:
-    """Return what is known of at least one wheel, side by side."""
+    """Return the quantities known for at least one wheel, side by side."""
     made = []
     for name in COMPARED:
         held = {

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Estimates as files: ``identification.json`` and ``motors.yaml``, written all or none."""
 
 import math
@@ -6,7 +7,7 @@ import shutil
 import tempfile
 from collections.abc import Iterable, Mapping
 from datetime import datetime, timezone
-from itertools import chain, pairwise
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +16,7 @@ import numpy as np
 
 from smp_motor_control.errors import is_ros_name, printable
 from smp_motor_control.motor.parameters import COMBINATIONS, PHYSICAL
-from smp_motor_control.parameter_file import written
+from smp_motor_control.parameter_file import format_parameters
 from smp_motor_ident.errors import BagError, ParameterError
 from smp_motor_ident.result import Estimate, Quantity
 
@@ -62,7 +63,7 @@ def read_identification(path: Path) -> dict[str, Estimate]:
 
 
 def _clean(value: Any) -> Any:
-    """Return what a document holds with its texts in one line."""
+    """Return a document's contents with line breaks in its texts replaced."""
     if isinstance(value, str):
         return printable(value)
     if isinstance(value, list):
@@ -102,7 +103,7 @@ def _matrix(kind: Any, value: Any) -> Any:
 
 
 def _check(estimate: Estimate) -> None:
-    """Refuse what has the right types and is impossible all the same."""
+    """Raise an error for impossible values of the right type."""
     size = len(estimate.names)
     if estimate.covariance.shape != (size, size) or len(set(estimate.names)) != size:
         raise ValueError(f"the covariance is not one of its {size} names")
@@ -115,9 +116,6 @@ def _check(estimate: Estimate) -> None:
             raise ValueError("residuals.model_error: frequencies must rise, bounds be positive")
     if size and (np.diag(estimate.covariance) < 0).any():
         raise ValueError("a variance is negative")
-    for name, number in chain.from_iterable(one.items() for one in estimate.alternatives):
-        if abs(number) > LARGEST:
-            raise ValueError(f"an alternative's {name} is {number:g}; no motor has that")
     for name, quantity in (*estimate.parameters.items(), *estimate.combinations.items()):
         if abs(quantity.value or 0.0) > LARGEST:
             raise ValueError(f"{name} is {quantity.value:g}; no motor has that")
@@ -159,7 +157,7 @@ def motor_entry(estimate: Estimate) -> dict[str, float | int]:
 def motors_yaml(estimates: Mapping[str, Estimate], provenance: Iterable[str] = ()) -> str:
     """Return ``motors.yaml``: a ROS 2 parameter file that ``motor_plant`` loads as it is."""
     motors = {wheel: motor_entry(estimate) for wheel, estimate in estimates.items()}
-    return written({"/**/motor_plant": {"motors": motors}}, provenance)
+    return format_parameters({"/**/motor_plant": {"motors": motors}}, provenance)
 
 
 def check_free(paths: Iterable[Path], force: bool) -> None:
@@ -195,7 +193,7 @@ def write_together(files: Mapping[Path, str | bytes], force: bool = False) -> No
 def _exchange(drafts: Mapping[Path, tuple[Path, str | bytes]]) -> None:
     """Write the drafts in full, then rename them into place; undo the renames on failure."""
     for draft, (_, body) in drafts.items():
-        # Of a path that is no UTF-8 a text may hold what no text can
+        # A path that is not UTF-8 may have put surrogates into the text
         draft.write_bytes(body.encode("utf-8", "replace") if isinstance(body, str) else body)
     done: list[tuple[Path, Path | None]] = []
     try:

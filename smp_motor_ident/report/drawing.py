@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A chart as SVG: for print, for a browser without script, and for figures in files."""
 
 import math

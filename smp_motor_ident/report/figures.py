@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The charts of one motor: fit over the data, residual correlations, frequency response."""
 
 from collections.abc import Sequence
@@ -14,10 +15,10 @@ from smp_motor_ident.result import ResidualTests
 POINTS = 8000  # of a curve over time; zoomed in tenfold that is still one a pixel
 VIEW = 80.0  # lags of the motor that a screen shows at first: single answers are seen there
 COHERENT = 0.6
-"""Below this coherence most of what a frequency shows is not the answer to the voltage."""
+"""Below this coherence most of the spectrum at a frequency is not the response to the voltage."""
 
 PAUSE = 20.0
-"""Intervals without a sample, behind which a spectrum begins anew."""
+"""Missing intervals after which a new spectrum begins."""
 
 Role = Literal["estimation", "validation"]
 

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Many recordings in one table: robots, wheels and dates, what drifts and what stands out."""
 
 import csv
@@ -15,7 +16,7 @@ from smp_motor_ident.report.limits import FLEET_DRIFT, FLEET_OUTLIER, FLEET_SIZE
 from smp_motor_ident.result import UNITS, Quantity
 
 QUANTITIES = ("dc_gain", "time_constant", "static_voltage", "resistance", "motor_constant")
-"""What is compared, where the recordings tell it."""
+"""Quantities compared, where the recordings determine them."""
 
 DAY = 86400.0
 
@@ -29,8 +30,8 @@ class Row:
     wheel: str
     source: str
     date: float | None  # when it was recorded [s since 1970], by its own stamps
-    values: Mapping[str, Quantity]  # by name, what is compared
-    fit_percent: float | None = None  # of the speed in held-out data; None where there is none
+    values: Mapping[str, Quantity]  # compared quantities by name
+    fit_percent: float | None = None  # of the speed in held-out data; None without such data
     unreliable: bool = False  # whether the identification calls itself so
     failure: str = ""  # why there are no values
     lost: bool = False  # whether that was not the recording's fault: the next run tries it again
@@ -55,8 +56,8 @@ def where(row: Row | Mark) -> str:
 def drifts(rows: Sequence[Row]) -> list[Mark]:
     """Return which motors change with time, by a straight line through their values.
 
-    The deviation of the slope is the larger of that from the stated deviations and that from the
-    scatter around the line.  What no recording shows is the same in all, and left out.
+    The standard deviation of the slope is the larger of that from the stated deviations and that
+    from the scatter around the line.  Systematic errors are common to all recordings and left out.
     """
     marks = []
     dated = [row for row in rows if row.date is not None]
@@ -91,7 +92,7 @@ def outliers(rows: Sequence[Row]) -> list[Mark]:
     """Return which motors differ from the same wheel of the other robots.
 
     Each robot's last value against the median of the robots, in units of their scatter
-    (1.4826 times the median deviation, and no less than what is stated of the value itself).
+    (1.4826 times the median deviation, but at least the value's own standard deviation).
     """
     marks = []
     for (_, wheel, name), held in _grouped(rows, lambda r: "").items():

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What `identifier` has seen of commissioned motors over the days: lines of a file, and charts.
 
 Each line is a JSON object: stamp [s], wheel, values (by name value and standard deviation),
@@ -14,7 +15,7 @@ import msgspec
 import numpy as np
 
 from smp_motor_ident.errors import BagError
-from smp_motor_ident.estimation.monitor import Monitor
+from smp_motor_ident.live.monitor import Monitor
 from smp_motor_ident.report.chart import Chart, Curve
 from smp_motor_ident.report.words import label
 
@@ -31,13 +32,13 @@ class Entry:
 
     stamp: float  # [s]
     wheel: str
-    # Value and standard deviation by name, of what was estimated then
+    # Estimate and standard deviation by name
     values: Mapping[str, tuple[float, float]]
     findings: tuple[str, ...] = ()  # codes
 
 
 def entry_of(stamp: float, wheel: str, monitor: Monitor) -> Entry:
-    """Return what a monitor knows now."""
+    """Return a monitor's present estimates."""
     known = {name for name, (state, _) in monitor.validity().items() if state == "estimated"}
     values = {name: one for name, one in monitor.values().items() if name in known}
     return Entry(stamp, wheel, values, tuple(f.code for f in monitor.findings()))
@@ -60,7 +61,9 @@ def read(path: Path) -> dict[str, list[Entry]]:
         except msgspec.DecodeError as error:
             if number == len(lines):
                 break  # the power went while it was written
-            raise BagError(f"{path}: line {number} is no entry of a history ({error})") from None
+            raise BagError(
+                f"{path}: line {number} is not an entry of a history ({error})"
+            ) from None
         out.setdefault(one.wheel, []).append(one)
     return {wheel: sorted(entries, key=lambda e: e.stamp) for wheel, entries in out.items()}
 

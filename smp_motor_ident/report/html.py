@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The page ``report.html``: one file that needs nothing else, for a reader who was not there."""
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ class Report:
     failures: Mapping[str, str] = field(default_factory=dict)
     # How the page came about: command, sources, date, versions
     provenance: Mapping[str, str] = field(default_factory=dict)
-    # By wheel what the tuning page offers; empty for a report without one
+    # Tuning page by wheel; empty for a report without one
     tunings: Mapping[str, Tuning] = field(default_factory=dict)
     # By wheel what `identifier` has seen since
     history: Mapping[str, Sequence[Chart]] = field(default_factory=dict)
@@ -61,7 +62,7 @@ def _tuning_page(tunings: Mapping[str, Tuning]) -> tuple[list[Chart], dict[str, 
 
 
 def _motor(estimate: Estimate, report: Report) -> dict[str, Any]:
-    """Return what the template shows of one motor, in the order of its reader's questions."""
+    """Return the template's data for one motor, in the order of a reader's questions."""
     wheel = estimate.wheel
     parts, since = report.comparisons.get(wheel, ()), report.history.get(wheel, ())
     shown, other = summary.select_messages(estimate)

@@ -1,9 +1,10 @@
+# SPDX-License-Identifier: Apache-2.0
 """Every threshold of a decision about many robots, with its unit and its reason.
 
 Printed with the others in ``docs/limits.md``.
 """
 
-from smp_motor_ident.diagnosis.limits import Limit
+from smp_motor_ident.limits import Limit
 
 FLEET_DRIFT = Limit(
     4.0,

@@ -1,6 +1,6 @@
-"""What a reader is told of a motor first: how far to trust it, in which numbers, and why."""
+# SPDX-License-Identifier: Apache-2.0
+"""Summarise a motor: verdict, main numbers and reasons."""
 
-import re
 import shlex
 from dataclasses import dataclass
 
@@ -8,11 +8,8 @@ from smp_motor_ident.finding import SEVERITIES, Finding
 from smp_motor_ident.report.words import is_told, put_within, to_sentence
 from smp_motor_ident.result import Estimate, Quantity
 
-MOST_MESSAGES = 3
+MAX_MESSAGES = 3
 """So many are shown of a motor without being asked for; more are not read."""
-
-POOR_FIT = 80.0
-"""Below, a fifth of the motion is unexplained [%]: a loop designed on it meets another motor."""
 
 
 @dataclass(frozen=True)
@@ -31,7 +28,7 @@ def select_messages(estimate: Estimate) -> tuple[list[Message], list[Message]]:
         Message(k, finding.severity, to_sentence(finding.message), to_sentence(finding.advice))
         for k, finding in enumerate(_by_severity(estimate), 1)
     ]
-    shown = min(sum(one.severity != "note" for one in told), MOST_MESSAGES)
+    shown = min(sum(one.severity != "note" for one in told), MAX_MESSAGES)
     return told[:shown], told[shown:]
 
 
@@ -55,12 +52,9 @@ def find_doubted(estimate: Estimate) -> dict[str, int]:
 
 
 def find_affected(finding: Finding, estimate: Estimate) -> list[str]:
-    """Return the quantities that a finding names, or all where it names none."""
+    """Return the quantities that a finding concerns, all where it names none."""
     known = _told(estimate)
-    message = re.sub(r"\bgain\b", "dc_gain", finding.message)
-    text = " ".join([message, str(finding.evidence.get("quantity")), *finding.evidence])
-    named = [name for name in known if re.search(rf"\b({name}|{put_within(name)})\b", text)]
-    return named or known
+    return [name for name in known if name in finding.quantities] or known
 
 
 def judge(estimate: Estimate) -> tuple[str, str]:
@@ -71,8 +65,6 @@ def judge(estimate: Estimate) -> tuple[str, str]:
         every = len(doubted) == len(_told(estimate))
         which = "every number" if every else ", ".join(map(put_within, doubted))
         return "poor", f"Unreliable: {which}"
-    if percent is not None and percent < POOR_FIT:
-        return "poor", "Poor fit: too little to build a controller on"
     warnings = sum(f.severity == "warning" for f in estimate.findings)
     if warnings:
         return "fair", f"Usable, with {warnings} warning{'s' if warnings > 1 else ''}"

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Pages that stand alone: a template, with all that it needs in itself."""
 
 from collections.abc import Sequence
@@ -15,7 +16,7 @@ from smp_motor_ident.report.drawing import svg
 
 
 def page(name: str, charts: Sequence[Chart] | None = None, **content: Any) -> str:
-    """Return a page by its template, with what draws ``charts``; what is not given is an error."""
+    """Return a page by its template, with the script for ``charts``; content must be complete."""
     environment = jinja2.Environment(
         loader=jinja2.PackageLoader("smp_motor_ident.report", "."),
         autoescape=True,

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Designs drawn: the figure of a tuning, and the page of designs over bandwidth and phase margin.
 
 Nothing of control is computed in the page; its sliders choose among these designs.
@@ -40,7 +41,7 @@ SAMPLES = 100  # motors that the bands of a choice are over: their ends are the 
 
 @dataclass(frozen=True, eq=False)
 class Choice:
-    """One design of the page, or why there is none at this place of the sliders."""
+    """One design of the page, or the reason why these slider positions have none."""
 
     bandwidth: float  # asked for [rad/s]
     phase_margin: float  # asked for [deg]
@@ -56,7 +57,7 @@ class Tuning:
     wheel: str  # name of the wheel
     # Margin after margin, the bandwidths of each in rising order; empty without a design
     choices: Sequence[Choice] = ()
-    chosen: int = -1  # index of what `tune` chooses by itself, -1 without a design
+    chosen: int = -1  # index of the default choice of `tune`, -1 without a design
     reason: str = ""  # why there is no design at all
 
 
@@ -223,8 +224,8 @@ def tuning_charts(wheels: Mapping[str, Curves], limit: float, prefix: str = "") 
 
 def _on(x: Array, own: Array, rows: Array) -> Array:
     """Return curves on another axis, shape (..., x.size); NaN outside of their own."""
-    flat = [np.interp(x, own, row, left=np.nan, right=np.nan) for row in np.atleast_2d(rows)]
-    return np.array(flat).reshape(*rows.shape[:-1], x.size)
+    flatten = [np.interp(x, own, row, left=np.nan, right=np.nan) for row in np.atleast_2d(rows)]
+    return np.array(flatten).reshape(*rows.shape[:-1], x.size)
 
 
 def tuning_svg(wheels: Mapping[str, Curves], limit: float) -> str:

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Numbers, names and messages in the reader's words, the same on the terminal and on pages."""
 
 import math
@@ -25,8 +26,9 @@ EXPLAINED: Mapping[str, tuple[str, str, str]] = {
     "steady_speed": ("ω∞", "Steady speed", "at the one voltage that was recorded"),
     "load_voltage": ("vl", "Load voltage", "offset that a constant load or sensor makes"),
     "averaging_window": ("w", "Averaging window", "over which the sensor averages the speed"),
-    "sensor_lag": ("τs", "Sensor lag", "by which the speed's low-pass is late"),
-    "dead_zone": ("vd", "Dead zone", "command for which the driver puts out nothing"),
+    "sensor_lag": ("τs", "Sensor lag", "of the speed's low-pass"),
+    "dead_zone": ("vd", "Dead zone", "command below which the driver puts out nothing"),
+    "least_command": ("vm", "Least command", "below which the driver puts out nothing"),
     "clip_voltage": ("vc", "Clip voltage", "the most that the driver puts out"),
     "slew_rate": ("dv/dt", "Slew rate", "how fast the driver's voltage rises"),
     "source_resistance_ratio": ("ρ", "Source resistance", "of the supply, over the armature's"),
@@ -35,7 +37,8 @@ EXPLAINED: Mapping[str, tuple[str, str, str]] = {
     "current_limit_voltage": ("vi", "Current limit", "of the driver, times the resistance"),
     "fast_decay_ratio": ("τₑf", "Fast-decay ratio", "electrical time constant in PWM periods"),
     "coasting_share": ("s₀", "Coasting share", "of back-EMF in the voltage at steady speed"),
-    "current_lag": ("τi", "Current lag", "by which the current's sensor is late on average"),
+    "current_lag": ("τi", "Current lag", "mean lag of the current sensor"),
+    "encoder_error": ("e", "Encoder error", "amplitude of its error once a turn"),
 }
 """Symbol, name and meaning of every quantity."""
 
@@ -48,9 +51,9 @@ MODELS: Mapping[str, str] = {
 
 
 SCALES = {"s": ("ms", 1e3), "s^2": ("ms^2", 1e6), "H": ("mH", 1e3), "N m": ("mN m", 1e3)}
-"""Units that a motor's numbers are small in: what is written instead, and how many of it."""
+"""Display units for small values, and their factors."""
 
-MOST_DIGITS = 9  # of a number: more are those of a simulation without noise
+MAX_DIGITS = 9  # of a number: more are those of a simulation without noise
 
 
 def label(name: str) -> str:
@@ -147,7 +150,7 @@ def _written(between: str, values: Sequence[float], of: Quantity) -> str:
     std, size = of.std or 0.0, max(abs(of.value or 0.0), of.std or 0.0)
     power = 0 if 1e-3 <= size < 1e6 else math.floor(math.log10(size))
     places = 1 - math.floor(math.log10(float(f"{std:.1e}"))) + power
-    places = min(places, MOST_DIGITS - 1 - math.floor(math.log10(size)) + power)
+    places = min(places, MAX_DIGITS - 1 - math.floor(math.log10(size)) + power)
     text = between.join(_fixed(value / 10.0**power, places) for value in values)
     superscript = str(power).translate(str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹"))
     return f"({text})·10{superscript}" if power else text

@@ -1,4 +1,5 @@
-"""From an identified motor to gains that hold on the sampled loop that will run."""
+# SPDX-License-Identifier: Apache-2.0
+"""Design gains for the sampled loop of an identified motor."""
 
 from smp_motor_ident.tune.designer import Design, compare, design, recommend
 from smp_motor_ident.tune.loop import Loop

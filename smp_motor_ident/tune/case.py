@@ -1,14 +1,15 @@
-"""One motor, one loop, one method: prepared, solved, and backed off where it has to be."""
+# SPDX-License-Identifier: Apache-2.0
+"""Solve one motor, loop and method, and reduce the gains if the uncertainty requires it."""
 
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
+from smp_motor_ident.chain.catalogue import chain_from
+from smp_motor_ident.chain.terminal import Driver, driver_of, put_out
 from smp_motor_ident.errors import DesignError
-from smp_motor_ident.estimation.driver_effect import driver_of
 from smp_motor_ident.finding import Finding
-from smp_motor_ident.model.driver import Driver, terminal_voltage
 from smp_motor_ident.result import Estimate
 from smp_motor_ident.tune.ensemble import Robustness, UncertaintyEnsemble, back_off, softer
 from smp_motor_ident.tune.feedback import Feedback
@@ -17,14 +18,12 @@ from smp_motor_ident.tune.methods import METHODS
 from smp_motor_ident.tune.motors import (
     Friction,
     draw_motors,
-    eccentric_of,
     every_other,
     friction_of,
     lag_in_sensor,
     lag_of_sensor,
     motors_of,
     outliers_of,
-    scatter_of,
     torque_noise_of,
     unreliable_spread,
 )
@@ -32,19 +31,19 @@ from smp_motor_ident.tune.plant import sample
 from smp_motor_ident.tune.problem import Method, Problem, RequiredMargins, checked
 from smp_motor_ident.tune.unmodelled import unmodelled_dynamics, words
 
-CLAMPED = 1 / 6
+MAX_CONTROL_NOISE = 1 / 6
 """Largest control noise [share of the supply, rms] of any gains: three times it is half of the
-supply, and a loop whose noise is clamped is none."""
+supply, and clamped noise opens the loop."""
 
 
-WORK, FEWEST = 5e7, 50
+WORK, MIN_DRAWS = 5e7, 50
 """Draws times the cube of the loop's states that is spent at most; and least draws."""
 
-COMMON = (
+COMMON_TARGETS = (
     "max_velocity", "max_acceleration", "transition_time", "together", "samples", "seed",
     "accept_unreliable",
 )  # fmt: skip
-"""Targets that every method understands."""
+"""Targets of all methods."""
 
 
 @dataclass(frozen=True)
@@ -76,17 +75,22 @@ class Case:
     def breakaway(self) -> float:
         """Least command [V] at which the motor must turn, whatever load there is; the supply's."""
         commands = np.linspace(0.0, self.problem.loop.supply_voltage, 256)
-        put_out = [terminal_voltage(self.driver, v, 0.0, v, 1.0)[0] for v in commands.tolist()]
-        enough = int(np.searchsorted(put_out, self.friction.planned + self.load))
+        numbers, lanes = self.driver.numbers, self.driver.lanes
+        volts = [put_out(numbers, lanes, v, 0.0, v, 1.0)[0] for v in commands.tolist()]
+        enough = int(np.searchsorted(volts, self.friction.planned + self.load))
         return float(commands[min(enough, commands.size - 1)])
 
 
 def prepare(estimate: Estimate, loop: Loop, method: str, targets: dict[str, Any]) -> Case:
     """Sample the motor and the draws of its distribution; see :func:`design`."""
     chosen = _method(method, targets)
-    findings = list(_reliability(estimate, bool(targets.get("accept_unreliable"))))
-    driver = driver_of(estimate)
-    loop = _behind(driver, loop)
+    findings = list(_check_reliability(estimate, bool(targets.get("accept_unreliable"))))
+    driver = driver_of(
+        chain_from(estimate.chain),
+        estimate.largest_voltage,
+        estimate.hardware.supply_voltage or 0.0,
+    )
+    loop = _limit_by_driver(driver, loop)
     friction = friction_of(estimate, loop.supply_voltage)
     lag = lag_of_sensor(estimate) if loop.reports_speed else None
     level = next((f for f in estimate.findings if f.code == "one_size_of_voltage"), None)
@@ -101,7 +105,7 @@ def prepare(estimate: Estimate, loop: Loop, method: str, targets: dict[str, Any]
     seed = int(checked(targets, "seed", least=-1) or 0)
     # Eigenvalues cost with the cube of the states: fewer motors where a loop has many.
     states = plant.taps.shape[1] + plant.window + 6
-    n = max(min(n, int(WORK / states**3)), FEWEST)
+    n = max(min(n, int(WORK / states**3)), MIN_DRAWS)
     motors = draw_motors(estimate, n, np.random.default_rng(seed), friction)
     if motors is not None and lag is not None:
         motors = every_other(motors, lag_in_sensor(motors))
@@ -122,15 +126,15 @@ def prepare(estimate: Estimate, loop: Loop, method: str, targets: dict[str, Any]
         driver,
         load,
         torque_noise_of(estimate, loop.sample_time),
-        scatter_of(estimate),
-        eccentric_of(estimate, loop),
+        estimate.evidence("arrival_beat", "latency"),
+        abs(estimate.chain.values.get("eccentricity", 0.0)),
         outliers_of(estimate) if loop.reports_speed else 0.0,
         lag is not None,
         tuple(findings),
     )
 
 
-def _behind(driver: Driver, loop: Loop) -> Loop:
+def _limit_by_driver(driver: Driver, loop: Loop) -> Loop:
     """Return a loop with its driver's limits: a ramp is late by half of its length.
 
     The margins bear that; planned changes are no faster than the driver, and not late.
@@ -140,8 +144,8 @@ def _behind(driver: Driver, loop: Loop) -> Loop:
     return replace(loop, supply_voltage=supply, delay=longest, usual_delay=loop.expected_delay)
 
 
-def _reliability(estimate: Estimate, accepted: bool) -> tuple[Finding, ...]:
-    """Refuse an unreliable estimate, or return what designing on it takes into account."""
+def _check_reliability(estimate: Estimate, accepted: bool) -> tuple[Finding, ...]:
+    """Refuse an unreliable estimate, or return a finding on the assumed uncertainty."""
     grave = [f for f in estimate.findings if f.severity in ("unreliable", "refused")]
     if not grave:
         return ()
@@ -149,19 +153,18 @@ def _reliability(estimate: Estimate, accepted: bool) -> tuple[Finding, ...]:
     if not accepted:
         raise DesignError(
             f"{estimate.wheel}: the identification is unreliable: {words}; gains designed on it "
-            "need not hold: record as advised, or design on it all the same with "
-            "--accept-unreliable"
+            "may fail. Record as advised, or accept this with --accept-unreliable"
         )
     spread = unreliable_spread(estimate)
     message = (
-        f"designed on an unreliable identification ({words}): every number of it is taken as known "
-        f"to {spread:.0%} at best"
+        f"designed on an unreliable identification ({words}): every parameter is assumed "
+        f"uncertain by at least {spread:.0%}"
     )
     return (Finding("unreliable_identification", "unreliable", message, {"spread": spread}),)
 
 
 def solve(case: Case) -> tuple[Feedback, float, Robustness]:
-    """Find the feedback gains, backed off as far as the uncertainty asks for it."""
+    """Find the feedback gains, reduced as the uncertainty requires."""
     ruled = case.method.solve(case.problem)
     quiet, calm = _within_clamp(case.problem, ruled)
     feedback, factor, robustness = back_off(case.ensemble.assess, quiet)
@@ -177,9 +180,12 @@ def solve(case: Case) -> tuple[Feedback, float, Robustness]:
 
 
 def _within_clamp(problem: Problem, feedback: Feedback) -> tuple[Feedback, float]:
-    """Soften gains until the control noise leaves room within the clamp."""
+    """Reduce gains until the control noise fits within the clamp."""
     factor, trial = 1.0, feedback
-    while problem.control_noise(trial) > CLAMPED * problem.loop.supply_voltage and factor > 0.01:
+    while (
+        problem.control_noise(trial) > MAX_CONTROL_NOISE * problem.loop.supply_voltage
+        and factor > 0.01
+    ):
         factor *= 0.95
         trial = softer(feedback, factor)
     return trial, factor
@@ -188,17 +194,17 @@ def _within_clamp(problem: Problem, feedback: Feedback) -> tuple[Feedback, float
 def _method(name: str, targets: dict[str, Any]) -> Method:
     if name not in METHODS:
         raise DesignError(f"method is {name!r}; it must be one of {', '.join(METHODS)}")
-    known = (*METHODS[name].targets, *COMMON)
+    known = (*METHODS[name].targets, *COMMON_TARGETS)
     unknown = [key for key in targets if key not in known]
     if unknown:
         raise DesignError(
-            f"the method {name!r} knows no target {unknown[0]!r}; it knows {', '.join(known)}"
+            f"the method {name!r} has no target {unknown[0]!r}; it has {', '.join(known)}"
         )
     return METHODS[name]
 
 
 def _required(method: Method, problem: Problem) -> RequiredMargins:
-    """Return the margins that the method requires, as far as the caller's targets leave it."""
+    """Return the margins that the method requires unless the caller's targets set them."""
     required = method.required
     return RequiredMargins(
         phase=problem.target("phase_margin", required.phase),

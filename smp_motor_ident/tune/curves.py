@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A design as curves: responses and frequency responses with the band of the estimate."""
 
 import math
@@ -21,7 +22,7 @@ QUANTILES = (0.01, 0.5, 0.99)
 
 @dataclass(frozen=True, eq=False)
 class Curves:
-    """What to draw of one design; bands are rows for 1 %, 50 % and 99 % of the motors."""
+    """Curves of one design; bands are rows for 1 %, 50 % and 99 % of the motors."""
 
     time: Array  # shape (k,), [s]
     reference: Array  # shape (k,), [rad/s, wheel]

@@ -1,4 +1,5 @@
-"""design: from an estimate and a loop to gains, with their margins and the reason; by all methods.
+# SPDX-License-Identifier: Apache-2.0
+"""Design gains from an estimate and a loop, with their margins and the reason, by any method.
 
 Methods work at the motor shaft; the gains that come out are per wheel rad/s.
 """
@@ -12,7 +13,7 @@ from smp_motor_control.pid import PidGains
 from smp_motor_ident.errors import DesignError
 from smp_motor_ident.finding import Finding
 from smp_motor_ident.result import Estimate
-from smp_motor_ident.tune.case import COMMON, Case, prepare, solve
+from smp_motor_ident.tune.case import COMMON_TARGETS, Case, prepare, solve
 from smp_motor_ident.tune.ensemble import Robustness
 from smp_motor_ident.tune.feedback import Feedback
 from smp_motor_ident.tune.limits import AS_GOOD, DELAY_BORNE, HELD_BACK, SETTLED
@@ -56,7 +57,7 @@ class Design:
 
     @property
     def settling(self) -> Settling:
-        """When a change of set-point has settled, and what that includes."""
+        """Settling of a change of set-point, and its parts."""
         bands = self.specification
         return Settling(
             value=bands.settling.value,
@@ -87,8 +88,8 @@ def design(estimate: Estimate, loop: Loop, method: str = "margin", **targets: An
     method : str
         One of :data:`METHODS`.
     **targets
-        What the method understands, such as ``phase_margin`` [deg] or ``bandwidth`` [rad/s], and
-        for all: ``max_velocity`` [rad/s, wheel], ``max_acceleration`` [rad/s^2, wheel],
+        Targets of the method, such as ``phase_margin`` [deg] or ``bandwidth`` [rad/s], and
+        for all methods: ``max_velocity`` [rad/s, wheel], ``max_acceleration`` [rad/s^2, wheel],
         ``transition_time`` [s], ``together`` (one of several motors that shall arrive together),
         ``samples`` (draws of the distribution), ``seed``,
         ``accept_unreliable`` (design on an unreliable estimate, with a wider distribution).
@@ -114,7 +115,9 @@ def finish(case: Case, feedback: Feedback, factor: float, robustness: Robustness
     margins = loop_margins(plant, feedback)
     quickest = _plan(case, controller, margins)
     free = "transition_time" not in problem.targets
-    reference, figures, bands = _calmest(quickest, _simulation(case, controller, margins), free)
+    reference, figures, bands = _select_reference(
+        quickest, _simulation(case, controller, margins), free
+    )
     reason, findings = _explain(case, margins, factor, robustness, (figures, bands))
     m = plant.motors
     return Design(
@@ -149,7 +152,7 @@ def finish(case: Case, feedback: Feedback, factor: float, robustness: Robustness
 def settles(case: Case, feedback: Feedback) -> bool:
     """Tell whether a largest settling time can be stated.
 
-    Where it cannot for the quickest change, none is sought: the others need not be simulated.
+    The quickest change decides, so that the others need not be simulated.
     """
     controller = controller_for(case.problem.loop, feedback)
     margins = loop_margins(case.problem.plant, feedback)
@@ -160,8 +163,8 @@ def settles(case: Case, feedback: Feedback) -> bool:
 def _simulation(
     case: Case, controller: Controller, margins: Margins
 ) -> Callable[[Reference], tuple[Performance, Specification]]:
-    """Return what tells the figures of a change of set-point."""
-    usual, feedback = _usual(case), controller.feedback
+    """Return the simulated figures of a change of set-point."""
+    usual, feedback = _sample_usual(case), controller.feedback
     noise, found = case.problem.control_noise(feedback), case.ensemble.margins(feedback)
     return lambda plan: figures_of(case, usual, controller, plan, (margins, found), noise)
 
@@ -173,7 +176,7 @@ def with_reference(case: Case, one: Design, reference: Reference) -> Design:
     return replace(one, reference=reference, performance=figures, specification=bands)
 
 
-def _usual(case: Case, motors: Motors | None = None) -> Plant:
+def _sample_usual(case: Case, motors: Motors | None = None) -> Plant:
     """Return the nominal motor, or another in its place, sampled with the loop's usual delay."""
     loop, nominal = case.problem.loop, case.problem.plant.motors
     expected = replace(loop, delay=loop.expected_delay)
@@ -206,11 +209,11 @@ def wheel_gains(case: Case, controller: Controller) -> PidGains:
 
 
 def _plan(case: Case, controller: Controller, margins: Margins) -> Reference:
-    loop, usual = case.problem.loop, _usual(case)
+    loop, usual = case.problem.loop, _sample_usual(case)
     plants = [usual]
     if case.lag_in_doubt:
-        plants.append(_usual(case, lag_in_sensor(usual.motors)))
-    # Of a delay that may be longer than usual no more is asked than the loop bears.
+        plants.append(_sample_usual(case, lag_in_sensor(usual.motors)))
+    # Require no more tolerance of additional delay than the loop can have.
     doubt = max(loop.delay_doubt, case.scatter)
     borne = replace(loop, delay_doubt=min(doubt, DELAY_BORNE.value * margins.delay))
     least = 0.4 / margins.crossover if margins.crossover > 0 else 0.0
@@ -220,16 +223,16 @@ def _plan(case: Case, controller: Controller, margins: Margins) -> Reference:
     )
 
 
-def _calmest(
+def _select_reference(
     quickest: Reference,
     figures: Callable[[Reference], tuple[Performance, Specification]],
     free: bool,
 ) -> tuple[Reference, Performance, Specification]:
-    """Return the reference, no quicker, whose stated settling is least, and its figures.
+    """Return the reference with the least stated settling time, and its figures.
 
-    Unknown dynamics answer quick changes most: these take as long to settle as slower ones, and
-    overshoot more.  Among those that settle in nearly the least time, the one that is stated to
-    overshoot least is taken.
+    Quick changes excite unmodelled dynamics most: they settle no sooner than slower ones, and
+    overshoot more.  Of the references with nearly the least settling time, the one with the least
+    stated overshoot is chosen.
     """
     tried = [(quickest, *figures(quickest))]
     most = (1 + AS_GOOD.value) * tried[0][2].settling.high  # NaN: nothing is tried
@@ -270,7 +273,7 @@ def _explain(
         )
         # Beyond the crossover |T| is as large as the gains: so much of it the rule's had.
         if robustness.unmodelled > HELD_BACK.value * min(factor, 1.0):
-            findings.append(_held_back(unmodelled))
+            findings.append(_report_limited_gains(unmodelled))
     if figures.control_noise > 1.05 * loop.noise_limit:
         noisy = (
             f"the measurement makes {figures.control_noise:.2g} V of control noise, above "
@@ -286,11 +289,11 @@ def _explain(
     return "; ".join(words), tuple(findings)
 
 
-def _held_back(unmodelled: UnmodelledDynamics) -> Finding:
+def _report_limited_gains(unmodelled: UnmodelledDynamics) -> Finding:
     return Finding(
         "unmodelled_dynamics",
         "warning",
-        "the gains are as large as a motor bears whose response is known only up to "
+        "the gains are limited because the motor's response is known only up to "
         f"{unmodelled.known:.3g} rad/s",
         {"known_frequency": unmodelled.known},
         "for larger gains record a voltage that changes faster, such as a pseudo-random binary one",
@@ -310,11 +313,11 @@ def _sensor(case: Case) -> str:
 def compare(estimate: Estimate, loop: Loop, **targets: Any) -> dict[str, Design | DesignError]:
     """Design by every method, each with the targets that it understands.
 
-    A method that cannot meet the demand is there as its error.
+    A method that cannot meet the targets is represented by its error.
     """
     results: dict[str, Design | DesignError] = {}
     for name in METHODS:
-        known = (*COMMON, *METHODS[name].targets)
+        known = (*COMMON_TARGETS, *METHODS[name].targets)
         own = {key: value for key, value in targets.items() if key in known}
         try:
             results[name] = design(estimate, loop, name, **own)
@@ -324,7 +327,7 @@ def compare(estimate: Estimate, loop: Loop, **targets: Any) -> dict[str, Design 
 
 
 def recommend(results: dict[str, Design | DesignError]) -> tuple[str, str]:
-    """Return the best of what :func:`compare` gave, and why; DesignError where none is sound."""
+    """Return the best result of :func:`compare`, with the reason; DesignError if none is valid."""
     sound = {
         name: r
         for name, r in results.items()

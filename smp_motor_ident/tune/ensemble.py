@@ -1,4 +1,5 @@
-"""Gains that hold for the motors that the data allow, not for the estimate alone."""
+# SPDX-License-Identifier: Apache-2.0
+"""Check gains for all motors within the uncertainty of the estimate."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -29,7 +30,7 @@ class Robustness:
 
 
 class UncertaintyEnsemble:
-    """Assesses gains over a batch of motors, whose response is computed once."""
+    """Assessment of gains over a batch of motors, whose response is computed once."""
 
     def __init__(
         self, plant: Plant, required: RequiredMargins, nominal: Problem | None = None

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The feedback path of the controller, and the loop that it closes.
 
 All at the motor shaft: volts per motor rad/s.  The integral is forward Euler and is used one

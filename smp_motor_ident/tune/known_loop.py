@@ -1,8 +1,8 @@
-"""The command of a known loop, reconstructed from set-points and speeds that a robot logged.
+# SPDX-License-Identifier: Apache-2.0
+"""Reconstruct the command of a known loop from logged set-points and speeds.
 
-A loop's arithmetic is deterministic: run on the set-points and the speeds that it had, from a
-state that is known, it gives the commands that it gave.  At rest with a set-point of 0 the state
-is known.
+A loop's arithmetic is deterministic: its set-points and speeds give its commands, starting from a
+known state, such as rest with a set-point of 0.
 """
 
 import math
@@ -21,15 +21,15 @@ from smp_motor_ident.tune.limits import COMMAND_RESOLUTION, LOOP_RATE, TICK_FIT
 Step = Callable[[float, float], float]
 """From set-point, in the target's unit, and speed of the wheel [rad/s] to the command [V]."""
 
-REGULAR = 0.5
-"""Of an interval: a step that is longer by so much lost a sample."""
+INTERVAL_TOLERANCE = 0.5
+"""Relative excess of an interval that indicates a lost sample."""
 
 DITHERS = 4
 
 
 @dataclass(frozen=True)
 class Setting:
-    """What a loop's arithmetic takes from its robot."""
+    """Properties of a robot that a loop's arithmetic needs."""
 
     numbers: Mapping[str, float]  # gains, by the target's names
     sample_time: float  # [s]
@@ -45,48 +45,49 @@ class KnownLoop:
     start: Callable[[Setting], Step]  # from a setting to the step of a loop that begins at rest
     # From the numbers to the loop's interval [s]; NaN where it is that of the log
     interval: Callable[[Mapping[str, float]], float] = lambda numbers: math.nan
-    remembers: bool = True  # whether a command depends on what was before
+    remembers: bool = True  # whether a command depends on earlier samples
 
 
 def reconstruct(record: Record, loop: KnownLoop, numbers: Mapping[str, float]) -> Record:
-    """Return a record whose ``voltage`` held set-points with the voltages that the loop commanded.
+    """Return a record with set-points as ``voltage`` replaced by the voltages of the loop.
 
-    It is that up to the first lost sample, and a SignalError where the commands cannot be known: no
-    speed or supply, another rate than the loop's, a start that is not at rest, coarse speeds.
+    The record ends at the first lost sample.  Raises SignalError if the commands are unknown: no
+    speed or supply, a rate that differs from the loop's, a start in motion, coarse speeds.
     """
     where = f"{record.source}: {record.wheel}"
     supply, velocity = record.hardware.supply_voltage, record.velocity
     if velocity is None or not np.all(np.isfinite(velocity)):
-        raise SignalError(f"{where}: the loop's speed is not there at every sample; map velocity")
+        raise SignalError(f"{where}: the loop's speed is missing at some samples; map velocity")
     if supply is None:
         raise SignalError(
-            f"{where}: supply_voltage is not known, so neither is a command's voltage"
+            f"{where}: the supply is unknown, and so is a command's voltage; map "
+            "supply_voltage=VOLTS"
         )
     T = _interval(record, loop, numbers)
-    record = _unbroken(record, T)
+    record = _cut_at_lost_sample(record, T)
     assert record.velocity is not None
     if loop.remembers and (record.voltage[1] != 0.0 or record.velocity[0] != 0.0):
         raise SignalError(
-            f"{where}: begins while the loop is at work, with an integral that is not known; "
+            f"{where}: begins while the loop is running, with an unknown integral; "
             "record from rest, before the first set-point"
         )
     per_turn = record.hardware.counts_per_revolution
     ticks = math.nan if per_turn is None else per_turn * record.hardware.gear_ratio / (2 * math.pi)
     setting = Setting(numbers, T, supply, ticks)
     speed = record.velocity / record.hardware.gear_ratio
-    speed, step, counted = _as_the_loop_had_it(speed, setting)
+    speed, step, counted = _restore_loop_speed(speed, setting)
     volts = _run(loop.start(setting), record.voltage, speed)
     error = _error(loop, setting, record.voltage, speed, step)
     if error > COMMAND_RESOLUTION.value * supply:
         raise SignalError(
-            f"{where}: the speed was logged in steps of {step:.3g} rad/s, so that the command is "
-            f"known to {error:.2g} V only; log more digits, or give counts_per_revolution if this "
+            f"{where}: the speed was logged in steps of {step:.3g} rad/s, so the command is known "
+            f"to {error:.2g} V only; log more digits, or give counts_per_revolution if this "
             "is a tick of the encoder"
         )
     note = Finding(
         "reconstructed_voltage",
         "note",
-        f"voltage: reconstructed by the loop that ran ({len(record)} samples); as right as its "
+        f"voltage: reconstructed by the known loop ({len(record)} samples); it depends on its "
         f"gains and the supply of {supply:g} V",
         {"error": error},
     )
@@ -106,22 +107,22 @@ def _interval(record: Record, loop: KnownLoop, numbers: Mapping[str, float]) -> 
     return T
 
 
-def _unbroken(record: Record, T: float) -> Record:
-    """Return what is before the first lost sample."""
-    lost = np.flatnonzero(np.diff(record.time) > (1 + REGULAR) * T)
+def _cut_at_lost_sample(record: Record, T: float) -> Record:
+    """Return the record up to the first lost sample."""
+    lost = np.flatnonzero(np.diff(record.time) > (1 + INTERVAL_TOLERANCE) * T)
     end = min([len(record), *record.starts[1:], *(lost[:1] + 1)])
     if end < len(record):
         if end < 2:
             raise SignalError(f"{record.source}: {record.wheel}: lost its second sample")
-        text = f"the loop is known up to a lost sample, {record.time[end - 1]:.4g} s; no further"
+        text = f"the loop is known only up to a lost sample at {record.time[end - 1]:.4g} s"
         note = Finding("lost_loop", "warning", text, {"samples": float(end)})
         record = record.slice(0, int(end))
         record = replace(record, findings=(*record.findings, note))
     return record
 
 
-def _as_the_loop_had_it(speed: Array, setting: Setting) -> tuple[Array, float, dict[str, Any]]:
-    """Return the speed as the loop had it, the step in which it was logged, and its counts.
+def _restore_loop_speed(speed: Array, setting: Setting) -> tuple[Array, float, dict[str, Any]]:
+    """Return the loop's own speed, the rounding of its log, and its counts.
 
     Whole ticks of every interval are counts: known far better than the speed at each instant.
     """
@@ -148,7 +149,7 @@ def _run(step: Step, setpoints: Array, speed: Array) -> Array:
 
 
 def _error(loop: KnownLoop, setting: Setting, setpoints: Array, speed: Array, step: float) -> float:
-    """Return what rounding of the logged speed makes of the command, rms [V]."""
+    """Return the error of the command by rounding of the logged speed, rms [V]."""
     if step == 0.0:
         return 0.0
     rng: Any = np.random.default_rng(0)

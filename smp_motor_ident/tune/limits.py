@@ -1,12 +1,13 @@
-"""Every threshold of a decision about gains and loops, with its unit and its reason.
+# SPDX-License-Identifier: Apache-2.0
+"""Thresholds for gains and loops, with units and reasons.
 
 Printed with the others in ``docs/limits.md``.
 """
 
-from smp_motor_ident.diagnosis.limits import Limit
-from smp_motor_ident.diagnosis.response_limits import RESONANCE_DAMPING
+from smp_motor_ident.infer.response_limits import RESONANCE_DAMPING
+from smp_motor_ident.limits import Limit
 
-# What may be designed on, and how far gains may go.
+# Requirements on the model, and limits of the gains.
 FRICTION_KNOWN = Limit(
     0.02,
     "share of the supply",
@@ -51,10 +52,10 @@ JUMP = Limit(
 UNKNOWN_RESPONSE = Limit(
     2.0,
     "of the model's response",
-    "relative error that is taken where the recording does not show the response: the least that "
-    "Skogestad and Postlethwaite (2005), section 7.4.2, take at high frequencies, where phase and "
-    "size of the response are unknown",
-    "test_tune_unmodelled.py: loop does not reach beyond what the recording shows",
+    "assumed relative error at frequencies without excitation: the smallest that Skogestad and "
+    "Postlethwaite (2005), section 7.4.2, assume at high frequencies, where phase and size of the "
+    "response are unknown",
+    "test_tune_unmodelled.py: the loop stays within the excited band",
 )
 RESONANCE = Limit(
     1 / (2 * RESONANCE_DAMPING.value),
@@ -65,28 +66,28 @@ RESONANCE = Limit(
 RESONANCE_DAMPED = Limit(
     0.5,
     "damping ratio",
-    "physical: the largest of a shaft; with more, one swing is left of a step's, by 16 % at most",
-    "test_tune_unmodelled.py: what a resonance adds is that of a simulated one",
+    "physical: the largest of a shaft; with more, a step causes one swing of 16 % at most",
+    "test_tune_unmodelled.py: the effect of a resonance equals that of a simulated one",
 )
 HELD_BACK = Limit(
     0.97,
-    "of what a loop bears",
-    "the step of gains that are scaled back: with less of unmodelled dynamics something else held "
-    "them, and a richer recording is not advised",
-    "test_tune_unmodelled.py: loop does not reach beyond what the recording shows",
+    "of the tolerated unmodelled dynamics",
+    "the step by which gains are reduced: below it another limit holds, and a richer recording "
+    "would not help",
+    "test_tune_unmodelled.py: the loop stays within the excited band",
 )
 DELAY_BORNE = Limit(
     0.5,
     "of the delay margin",
-    "an answer that is later by this leaves half of the phase margin; of a loop that bears less "
-    "than `delay_doubt` no more is asked",
+    "this additional delay leaves half of the phase margin; a loop that tolerates less than "
+    "`delay_doubt` is not required to tolerate more",
     "test_tune_truth.py",
 )
 AS_GOOD = Limit(
     0.1,
     "of a settling time",
-    "cost: a change that is stated to settle later by a tenth is none that a driver notices, one "
-    "that may overshoot several times as far is",
+    "cost: a driver does not notice a tenth more settling time, but does notice several times the "
+    "overshoot",
     "test_tune_truth.py",
 )
 
@@ -94,14 +95,14 @@ AS_GOOD = Limit(
 COMMAND_RESOLUTION = Limit(
     1 / 255,
     "of the supply, rms",
-    "one step of an 8-bit PWM: a command that is known closer is known as well as it was given",
-    "test_known_loop.py: what is not known is refused",
+    "one step of an 8-bit PWM, the resolution of a command",
+    "test_known_loop.py: unknown commands are refused",
 )
 LOOP_RATE = Limit(
     0.02,
     "of the interval",
     "clocks of boards are within 2 %; a log at another rate leaves commands out",
-    "test_known_loop.py: what is not known is refused",
+    "test_known_loop.py: unknown commands are refused",
 )
 TICK_FIT = Limit(
     0.05,
@@ -120,19 +121,19 @@ SETTLED = Limit(
 OVERSHOOT = Limit(
     0.01,
     "of a change of set-point",
-    "what the reference is planned to overshoot at most: a load or a count may use it up",
+    "the largest planned overshoot of the reference: a load or a count may use it up",
     "test_verification.py: a wheel that does as designed",
 )
 SILENCE = Limit(
     0.1,
-    "s without an answer",
-    "half of what lets wheel_pid stop the wheel: such a drive shows the computer, not the gains",
+    "s without a response",
+    "half of wheel_pid's time-out: such a drive tests the computer, not the gains",
     "test_verification.py: a drive without control",
 )
 STEADY_ERROR = Limit(
     0.02,
     "of a change of set-point",
-    "the same band: integral action leaves no error, only what has not settled",
+    "the same band: integral action leaves no error but the unsettled rest",
     "test_verification.py: a speed that stays off",
 )
 DRIVE_LEVEL = Limit(

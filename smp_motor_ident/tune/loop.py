@@ -1,4 +1,5 @@
-"""Loop: the sampled loop that will run, as far as the design must know it."""
+# SPDX-License-Identifier: Apache-2.0
+"""Loop: the sampled loop for which gains are designed."""
 
 import math
 from dataclasses import dataclass, fields
@@ -26,9 +27,9 @@ class Loop:
     usual_delay : float or None
         The same as it usually is [s], for the timing of the reference, where ``delay`` is the
         longest that the margins must bear.  None takes ``delay``: a driver whose loop has a
-        fixed rate applies at its next sample whatever came in between.
+        fixed rate applies at its next sample the last command in between.
     delay_doubt : float
-        By which the delay may be longer than usual without overshoot that matters [s].
+        Increase of the delay that may not cause significant overshoot [s].
     gear_ratio : float
         Motor revolutions per wheel revolution [-].
     counts_per_revolution : float or None
@@ -36,7 +37,7 @@ class Loop:
     supply_voltage : float
         Largest voltage of either sign [V].
     speed_source : {'measured', 'difference', 'observer'}
-        What the controller feeds back: the speed in the message, counts differenced over
+        Source of the controlled speed: the speed in the message, counts differenced over
         ``difference_window`` samples, or the observer's estimate.
     difference_window : int
         Samples over which the speed is averaged: by the controller for ``difference``, by the

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Margins of the sampled loop: phase, gain, delay and peak of the sensitivity.
 
 Loops are read where their frequency response on a grid crosses unit gain and the real axis: a

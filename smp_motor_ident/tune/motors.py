@@ -1,4 +1,5 @@
-"""Motors as the design takes them: what fixes the response of a drive, and draws of it."""
+# SPDX-License-Identifier: Apache-2.0
+"""Motors for the design: parameters of the response, and random draws of them."""
 
 import math
 from dataclasses import dataclass, field, fields, replace
@@ -15,7 +16,6 @@ from smp_motor_ident.tune.limits import (
     FRICTION_RANGE,
     UNRELIABLE_SPREAD,
 )
-from smp_motor_ident.tune.loop import Loop
 
 SENSOR = ("delay", "averaging_window", "sensor_lag")
 """Delays between the motor's speed and the reported one, in s each."""
@@ -32,7 +32,7 @@ def _zero() -> Array:
 
 @dataclass(frozen=True, eq=False)
 class Motors:
-    """What fixes the response from voltage to reported speed, for a batch of motors."""
+    """Parameters of the response from voltage to reported speed, for a batch of motors."""
 
     # a0, a1, a2: shape (n,): coefficients [V s/rad], [V s^2/rad], [V s^3/rad] of ``a2 s^2 + a1 s +
     # a0``
@@ -40,7 +40,7 @@ class Motors:
     a1: Array
     a2: Array
     delay: Array  # shape (n,), [s]: the motor's own delay, from applied voltage to reported speed
-    static_voltage: Array  # shape (n,), [V]: what Coulomb friction takes
+    static_voltage: Array  # shape (n,), [V]: Coulomb friction
     # shape (n,), [s]: over which the reported speed is averaged; 0 where none was identified
     averaging_window: Array = field(default_factory=_zero)
     # shape (n,), [s]: time constant of the filter of the reported speed
@@ -67,7 +67,7 @@ class Friction:
 
     @property
     def planned(self) -> float:
-        """What the reference must leave room for [V]."""
+        """Voltage that the reference must keep in reserve [V]."""
         return self.known if self.finding is None else self.high
 
 
@@ -84,7 +84,7 @@ def friction_of(estimate: Estimate, supply: float) -> Friction:
     else:
         half = 1.96 * (quantity.std or 0.0)
         low, high = quantity.value - half, quantity.value + half
-    # Whoever turned the motor did so with less than the supply.
+    # The motor turned, so friction is below the supply.
     low, high = max(low, 0.0), high if quantity.total_std == 0.0 else min(high, supply)
     if high - low > FRICTION_RANGE.value * supply:
         raise DesignError(
@@ -125,15 +125,14 @@ def draw_motors(
 
     Positive quantities are drawn log-normally, quantities that may be zero normally and clipped
     there.  An unreliable estimate is drawn at least as wide as its unexplained share.  A second lag
-    that the record hides is uniform over its range, and each motor is moved a random part of the
-    way to one of the alternatives that the record leaves open.
+    that the record hides is uniform over its range.
     """
     names = _names(estimate)
     mean = np.array([estimate.value(name) for name in names])
     covariance = _covariance(estimate, names, mean)
     wide = friction is not None and friction.high > friction.low
     hidden = _hidden_lag(estimate)
-    if not (np.any(np.diag(covariance) > 0) or wide or hidden or estimate.alternatives):
+    if not (np.any(np.diag(covariance) > 0) or wide or hidden):
         return None
     positive = np.array([name in _POSITIVE for name in names])
     scale = np.where(positive, np.where(positive, mean, 1.0), 1.0)
@@ -149,7 +148,6 @@ def draw_motors(
     }
     if hidden and "dc_gain" in names:
         values["time_constant_product"] = rng.uniform(*hidden, n)
-    values = _towards_alternatives(estimate, values, rng)
     motors = _motors(estimate, values)
     if friction is not None:
         static = np.clip(motors.static_voltage, friction.low, friction.high)
@@ -157,26 +155,6 @@ def draw_motors(
             static = rng.uniform(friction.low, friction.high, n)
         motors = replace(motors, static_voltage=static)
     return motors
-
-
-def _towards_alternatives(
-    estimate: Estimate, values: dict[str, Array], rng: np.random.Generator
-) -> dict[str, Array]:
-    """Return draws, each moved a part of the way to an alternative, or to none."""
-    if not estimate.alternatives:
-        return values
-    n = next(iter(values.values())).size
-    one, share = rng.integers(1 + len(estimate.alternatives), size=n), rng.uniform(size=n)
-    out = {}
-    for name, drawn in values.items():
-        stated = estimate.value(name)
-        absent = 0.0 if name in _ABSENT else stated
-        ends = np.array([stated, *(e.get(name, absent) for e in estimate.alternatives)])[one]
-        if name in _POSITIVE:
-            out[name] = drawn * (1 + share * (ends / stated - 1))
-        else:
-            out[name] = np.maximum(drawn + share * (ends - stated), 0.0)
-    return out
 
 
 def _hidden_lag(estimate: Estimate) -> tuple[float, float] | None:
@@ -189,52 +167,31 @@ def _hidden_lag(estimate: Estimate) -> tuple[float, float] | None:
 
 
 def lag_of_sensor(estimate: Estimate) -> Finding | None:
-    """Return the finding where the second lag may be the reported speed's filter."""
-    found = next((f for f in estimate.findings if f.code == "second_lag"), None)
-    if found is None or found.severity != "warning":
+    """Return a finding where the second lag may be the reported speed's filter."""
+    causes = {s.cause for q in estimate.combinations.values() for s in q.systematic}
+    if "low_passed_speed" not in causes:
         return None
     return Finding(
-        found.code,
+        "second_lag",
         "warning",
-        "the second lag may be a filter's of the reported speed, which the motor is ahead of: the "
-        "bands of the specification cover both",
-        found.evidence,
-        found.advice,
+        "the second lag may belong to the motor or to a filter of the reported speed: the bands of "
+        "the specification cover both",
+        advice="record the encoder's counts",
     )
 
 
 def torque_noise_of(estimate: Estimate, sample_time: float) -> float:
-    """Return the load that fluctuates, as the voltage that it takes over a sample [V rms].
+    """Return the fluctuating load as an equivalent voltage over a sample [V rms].
 
-    Where the recording shows more of an error than the response itself, that is a resonance, which
-    the bands hold as such; what commands made that came late by scatter is none of a load.
+    A model error larger than the response itself is a resonance and belongs to the bands of
+    unmodelled dynamics.
     """
     error = estimate.residuals.model_error
     if error is not None and max(2 * s - b for s, b in zip(error.shown, error.bound)) > 1:
         return 0.0
     inertia = estimate.value("time_constant") / estimate.value("dc_gain", math.inf)
     load = inertia * estimate.evidence("torque_noise", "acceleration")
-    late = estimate.evidence("command_jitter", "as_noise")
-    return math.sqrt(max(load**2 - late**2, 0.0) / sample_time)
-
-
-def scatter_of(estimate: Estimate) -> float:
-    """Return by how much the instants of commands and samples scatter [s rms]."""
-    late = estimate.evidence("command_jitter", "scatter")
-    return math.hypot(late, estimate.evidence("arrival_beat", "latency"))
-
-
-def eccentric_of(estimate: Estimate, loop: Loop) -> float:
-    """Return the amplitude of an encoder's error once a turn [rad].
-
-    A sine explains half the square of its amplitude in each sample, in units of the noise's; where
-    a load fluctuates, which is larger, the error is part of that.
-    """
-    if estimate.evidence("torque_noise", "acceleration"):
-        return 0.0
-    explained = estimate.evidence("encoder_error", "explained_deviance")
-    noise = math.hypot(loop.count_angle / math.sqrt(12), loop.angle_noise)
-    return noise * math.sqrt(2 * explained / max(estimate.samples, 1))
+    return load / math.sqrt(sample_time)
 
 
 def outliers_of(estimate: Estimate) -> float:
@@ -246,8 +203,8 @@ def outliers_of(estimate: Estimate) -> float:
 def lag_in_sensor(motors: Motors) -> Motors:
     """Return motors with the second lag as the reported speed's filter.
 
-    From voltage to what is reported they answer the same; two lags that would ring, by the error
-    of an estimate, are taken for equal ones.
+    The response from voltage to reported speed is the same; two lags that would be complex because
+    of estimation errors are set equal.
     """
     total, product = motors.a1 / motors.a0, motors.a2 / motors.a0
     short = 0.5 * (total - np.sqrt(np.maximum(np.square(total) - 4 * product, 0.0)))
@@ -273,9 +230,10 @@ def _covariance(estimate: Estimate, names: tuple[str, ...], mean: Array) -> Arra
     index = [estimate.names.index(names[k]) for k in known]
     covariance[np.ix_(known, known)] = estimate.covariance[np.ix_(index, index)]
     for one in estimate.systematic:
-        if one.cause != "second_lag":  # `lag_in_sensor` draws which of the two lags is the motor's
-            moves = {name: by for name, by in one.moves.items() if name in estimate.names}
-            move = np.array([moves.get(name, 0.0) for name in names])
+        if (
+            one.cause != "low_passed_speed"
+        ):  # `lag_in_sensor` draws which of the two lags is the motor's
+            move = np.array([one.moves.get(name, 0.0) for name in names])
             covariance += np.outer(move, move)
     spread = np.zeros(len(names))
     if estimate.unreliable:
@@ -285,7 +243,7 @@ def _covariance(estimate: Estimate, names: tuple[str, ...], mean: Array) -> Arra
 
 
 def unreliable_spread(estimate: Estimate) -> float:
-    """Return the relative deviation that numbers of an unreliable estimate are given."""
+    """Return the relative standard deviation assumed for an unreliable estimate."""
     fit = estimate.fit_percent.validation
     unexplained = 1.0 if fit is None else 1.0 - fit / 100
     return min(max(UNRELIABLE_SPREAD.value, unexplained), 0.5)
@@ -299,8 +257,8 @@ def _names(estimate: Estimate) -> tuple[str, ...]:
     grave = (f for f in estimate.findings if f.severity != "note" and f.advice)
     advice = "; ".join(f.advice for f in grave)
     raise DesignError(
-        f"{estimate.wheel}: the estimate holds neither dc_gain and time_constant nor all physical "
-        "parameters, so that no gains can be stood for; "
+        f"{estimate.wheel}: the estimate has neither DC gain and time constant nor all physical "
+        "parameters, so no gains can be designed; "
         + (advice or "record two or more voltages in both directions and identify the motor again")
     )
 
@@ -317,11 +275,11 @@ def _motors(estimate: Estimate, value: dict[str, Array]) -> Motors:
         static = R * value["coulomb_friction"] / K
     if not (np.all(a0 > 0) and np.all(a1 > 0) and np.all(a2 >= 0) and np.all(np.isfinite(a0))):
         raise DesignError(
-            f"{estimate.wheel}: dc_gain and time_constant must be positive, they are "
+            f"{estimate.wheel}: DC gain and time constant must be positive, they are "
             f"{1 / a0[0]:.4g} rad/s/V and {a1[0] / a0[0]:.4g} s"
         )
     sensor = (np.maximum(value[name], 0.0) for name in SENSOR)
     delay, window, lag = sensor
-    # A low-pass of means is late by its time constant and half of what each mean is over.
+    # A low-pass of means lags by its time constant and half the window of each mean.
     lag = np.maximum(lag - 0.5 * window, 0.0)
     return Motors(a0, a1, a2, delay, np.abs(static), window, lag)

@@ -1,4 +1,5 @@
-r"""How the loop sees the speed through the observer: a linear filter of angle and voltage.
+# SPDX-License-Identifier: Apache-2.0
+r"""The observer in the loop: a linear filter of angle and voltage.
 
 The observer's angle only ever appears as its difference ``e`` from the counted one, so the filter
 has no state that grows.  With ``r = (speed, acceleration, load)`` and, over one sample, the angle
@@ -28,7 +29,7 @@ SPEED = 1
 
 @dataclass(frozen=True, eq=False)
 class ObserverModel:
-    """The observer as a filter, the same for every motor that it may meet."""
+    """The observer as a filter, which is the same for all motors of a batch."""
 
     advance: Array  # shape (q, q)
     # by_angle, by_voltage: shape (q,)

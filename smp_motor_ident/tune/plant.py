@@ -1,4 +1,5 @@
-r"""The motor as a sampled loop sees it: exact zero-order hold with a delay of any length.
+# SPDX-License-Identifier: Apache-2.0
+r"""Sampled motor with exact zero-order hold and a delay of any length.
 
 A batch of ``n`` motors :math:`e^{-sD} / (a_2 s^2 + a_1 s + a_0)` is sampled at once, so that
 one motor and a thousand draws of an uncertain one are the same few array operations.  How the
@@ -25,7 +26,7 @@ from smp_motor_ident.tune.motors import Motors
 from smp_motor_ident.tune.observer_model import ObserverModel, observer_model
 
 LONGEST = 300
-"""Samples of delay and averaging that a loop may have."""
+"""Largest delay and averaging of a loop [samples]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,8 +47,8 @@ class Plant:
     # the measured speed; with ``q`` 0 it is the last state of a sensor with lag, else the speed
     # itself
     average: Array
-    motors: Motors  # what was sampled
-    # The observer whose speed is fed back, where there is one; then ``q`` is 0
+    motors: Motors  # the sampled motors
+    # The observer whose speed is fed back, if any; then ``q`` is 0
     observer: ObserverModel | None = None
 
     def __len__(self) -> int:
@@ -93,7 +94,7 @@ class Plant:
         return averaged
 
     def through_motor(self, omega: Array) -> Complex:
-        """Return the response without what an observer predicts from the voltage itself."""
+        """Return the response without an observer's prediction from the voltage."""
         z = np.exp(1j * np.asarray(omega) * self.sample_time)
         return self.transfer(z) - self._predicted(z)
 
@@ -163,7 +164,7 @@ def _window(motors: Motors, loop: Loop) -> Array:
     own = np.full(len(motors), loop.difference_window * loop.sample_time)
     if not loop.reports_speed or loop.averaging_given:
         return own
-    # A filter that was identified is all that the sensor does.
+    # An identified filter is the sensor's whole effect.
     plain = np.where(motors.sensor_lag > 0, 0.0, own)
     found = np.where(motors.averaging_window > 0, motors.averaging_window, plain)
     return np.maximum(found, 0.01 * loop.sample_time) if np.any(found > 0) else found
@@ -185,8 +186,8 @@ def _check_length(delay: float, window: float, loop: Loop) -> None:
         return
     raise DesignError(
         f"a delay of {1e3 * delay:.4g} ms and a window of {1e3 * window:.4g} ms at "
-        f"{loop.rate:.4g} Hz are {samples} samples, of which at most {LONGEST} can be designed "
-        f"for; sample at {LONGEST / max(delay + window, loop.sample_time):.3g} Hz or less, or "
+        f"{loop.rate:.4g} Hz are {samples} samples, more than the limit of {LONGEST}. "
+        f"Sample at {LONGEST / max(delay + window, loop.sample_time):.3g} Hz or less, or "
         "average over fewer samples"
     )
 
@@ -209,7 +210,7 @@ def _hold(motors: Motors, t: Array) -> tuple[Array, Array, Array, Array]:
     """Return transition, effect of a held volt, and both for the angle, over ``t``.
 
     With a sensor of lag f its speed y is a third state: ``y + f y' = w`` has the particular
-    solution ``c1 w + c2 w'``, and the angle that it runs through lags by what it still holds.
+    solution ``c1 w + c2 w'``, and its angle lags by the filter's stored part.
     """
     gain, tau, tp = 1 / motors.a0, motors.a1 / motors.a0, motors.a2 / motors.a0
     held = zero_order_hold(gain, tau, tp, t)

@@ -1,4 +1,5 @@
-"""The problem that every tuning method gets: the sampled plant, its reductions and its noise."""
+# SPDX-License-Identifier: Apache-2.0
+"""Input of every tuning method: the sampled plant, its reductions and its noise."""
 
 import math
 from collections.abc import Callable, Mapping
@@ -28,7 +29,7 @@ class RequiredMargins:
 
 @dataclass(frozen=True)
 class FirstOrderDelay:
-    """``gain e^{-delay s} / (time_constant s + 1)``: what the classical rules start from."""
+    """``gain e^{-delay s} / (time_constant s + 1)``, the model of the classical rules."""
 
     gain: float  # [rad/s/V]
     # time_constant, delay: [s]
@@ -134,7 +135,7 @@ class Problem:
 
     @property
     def structure(self) -> str:
-        """``pi`` or ``pid`` as the caller asks for it, empty where he does not."""
+        """Requested structure, ``pi`` or ``pid``; empty for the default."""
         value = self.targets.get("structure")
         if value not in (None, "pi", "pid"):
             raise DesignError(f"structure is {value!r}; it must be pi or pid")

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 r"""Feed-forward and reference: what makes wheels arrive together and without overshoot.
 
 The feed-forward is the motor's own equation, ``a2 r'' + a1 r' + a0 r`` and dry friction, of the
@@ -23,7 +24,7 @@ from smp_motor_control.arrays import Array
 from smp_motor_control.reference import minimum_jerk
 from smp_motor_control.reference.minimum_jerk import PEAK_ACCELERATION
 from smp_motor_control.reference.profile import Drive, Profile, ProfileLimits
-from smp_motor_control.wheel.loop import LONGEST_TRANSITION
+from smp_motor_control.wheel.loop import MAX_TRANSITION_S
 from smp_motor_ident.errors import DesignError
 from smp_motor_ident.tune.feedback import Feedback
 from smp_motor_ident.tune.loop import Loop
@@ -49,9 +50,9 @@ class Reference:
     max_acceleration: float  # [rad/s^2]; infinite where voltage alone limits
     # Duration of every minimum-jerk change [s]; larger ones are made as fast as limits allow
     transition_time: float
-    lag: float  # by which the measured speed follows the reference [s]
-    doubt: float  # by which that may be wrong without the feedback taking it for an error [s]
-    drive: Drive  # motor and voltage that large changes keep to
+    lag: float  # of the measured speed behind the reference [s]
+    doubt: float  # error of that lag which the feedback ignores [s]
+    drive: Drive  # motor and voltage limit for large changes
 
     def at_wheel(self, gear_ratio: float) -> "Reference":
         """Return the same at the wheel."""
@@ -88,8 +89,7 @@ def controller_for(loop: Loop, feedback: Feedback) -> Controller:
 class Change:
     """A planned change of set-point from rest, at the sampling instants; each of shape (k,)."""
 
-    # low, reference, high: [rad/s]: what the measurement is compared with, and between what it is
-    # left alone
+    # low, reference, high: [rad/s]: set-point of the feedback, and bounds of its dead band
     low: Array
     reference: Array
     high: Array
@@ -98,7 +98,7 @@ class Change:
 
     @property
     def inputs(self) -> Inputs:
-        """What the loop gets of it."""
+        """Inputs of the loop."""
         return Inputs(self.low, self.high, self.forward)
 
 
@@ -117,7 +117,7 @@ def planned_change(plant: Plant, plan: Reference, distance: float, time: Array) 
         for late in (plan.doubt, 0.0, -min(plan.doubt, plan.lag))
     ]
     low, high = np.min(around, axis=0), np.max(around, axis=0)
-    # From rest the running loop leads along a ramp, with what the rate of its current takes.
+    # From rest the running loop leads along a ramp, limited by the rise of its current.
     electrical = float(m.a2[0] / m.a1[0])
     reach = np.abs(rate) * max(0.25 * electrical, 0.5 * T)
     share = np.clip(np.divide(speed, reach, out=np.sign(speed), where=reach != 0), -1.0, 1.0)
@@ -222,10 +222,10 @@ def _quickest(
         if all(_overshoot(led, one, linear, plan) <= most for led, one, most in trials):
             return plan
         grains += max(1, grains // 16)
-        if grains * grain > LONGEST_TRANSITION:
+        if grains * grain > MAX_TRANSITION_S:
             break
     raise DesignError(
-        f"every change of set-point shorter than {LONGEST_TRANSITION:g} s overshoots; ask for a "
+        f"every change of set-point shorter than {MAX_TRANSITION_S:g} s overshoots; ask for a "
         "larger phase_margin"
     )
 

@@ -1,13 +1,14 @@
-r"""What a resonance that the recording does not exclude does to a change of set-point.
+# SPDX-License-Identifier: Apache-2.0
+r"""Effect of a resonance that the recording does not exclude on a change of set-point.
 
-A mass on a spring makes of a motor's response G the response ``G (1 + D)`` with
+A mass on a spring changes a motor's response G to ``G (1 + D)`` with
 
     D(s) = m s^2 / (s^2 + 2 z w s + w^2),
 
 m being -1 where the speed is the mass's, and the ratio of its inertia to the rotor's where it is
-the rotor's.  For every w, and the dampings z of shafts, the largest m of either sign up to 1 is
-taken with which ``|D|`` is nowhere above the bound of unmodelled dynamics.  A loop that answers
-with y where the motor is G is off by
+the rotor's.  For every w, and the dampings z of shafts, m is the largest of either sign up to 1
+that keeps ``|D|`` below the bound of unmodelled dynamics.  A loop whose response with the motor G
+is y has the error
 
     E = D S Y / (1 + D T),
 
@@ -24,7 +25,7 @@ import math
 import numpy as np
 
 from smp_motor_control.arrays import Array, Complex
-from smp_motor_ident.diagnosis.response_limits import RESONANCE_DAMPING
+from smp_motor_ident.infer.response_limits import RESONANCE_DAMPING
 from smp_motor_ident.tune.feedback import Feedback
 from smp_motor_ident.tune.limits import RESONANCE_DAMPED, SETTLED
 from smp_motor_ident.tune.plant import Plant
@@ -92,11 +93,11 @@ def largest(unmodelled: UnmodelledDynamics, at: Array, damping: float, sample_ti
 
 
 def _loop(plant: Plant, feedback: Feedback, omega: Array, answer: Array) -> tuple[Complex, Complex]:
-    """Return T of what goes through the motor, and S Y: what of an error reaches the speed."""
+    """Return T through the motor, and S Y: the response of the speed to an error."""
     z = np.exp(1j * omega * plant.sample_time)
     control = feedback.response(omega, plant.sample_time)
     response, through = plant.response(omega)[0], plant.through_motor(omega)[0]
-    # What an observer predicts of the voltage itself is no loop around the motor.
+    # An observer's prediction from the voltage closes no loop around the motor.
     own = 1 + control * (response - through)
     spectrum = np.fft.rfft(np.diff(answer, prepend=0.0))[1:] / (1 - 1 / z)
     whole = 1 + control * response

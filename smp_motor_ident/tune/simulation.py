@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Step and load responses of the loop, of a batch of motors at once.
 
 The running PID (saturation, anti-windup, set-point weights, feed-forward) on the sampled
@@ -12,15 +13,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from smp_motor_control.arrays import Array
-from smp_motor_control.observer import DISAGREE, INNOVATION_MEMORY
+from smp_motor_control.observer import DISTRUST_RATIO, INNOVATION_MEMORY_S
 from smp_motor_ident._compile import compiled
-from smp_motor_ident.model.driver import Driver, terminal_voltage
+from smp_motor_ident.chain.terminal import Driver, no_driver, put_out
 from smp_motor_ident.tune.feedback import Feedback
 from smp_motor_ident.tune.limits import SETTLED
 from smp_motor_ident.tune.observer_model import NO_OBSERVER, SPEED
 from smp_motor_ident.tune.plant import Plant
 
-NO_EFFECT = Driver()
+NO_EFFECT = no_driver()
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,7 +63,7 @@ class Inputs:
 def white(
     deviation: float, shape: tuple[int, int], seed: int = 0, of: NDArray[np.bool_] | None = None
 ) -> Array | None:
-    """Return white noise, the same every time, ``of`` some motors or all; None where is none."""
+    """Return reproducible white noise ``of`` some motors or all; None without noise."""
     if deviation == 0.0:
         return None
     noise = np.asarray(deviation * np.random.default_rng(seed).standard_normal(shape))
@@ -105,7 +106,7 @@ def simulate(
         still if inputs.load is None else np.broadcast_to(inputs.load, (n, steps)),
         np.zeros(n) if friction is None else np.ascontiguousarray(friction),
         modelled, np.full(n, count_angle), speed_step, np.full(n, eccentric),
-        np.ascontiguousarray(noise), np.ascontiguousarray(of_angle), driver,
+        np.ascontiguousarray(noise), np.ascontiguousarray(of_angle), driver.numbers, driver.lanes,
         np.broadcast_to(plant.motors.a0, n),
     )  # fmt: skip
     return Response(*found)
@@ -185,17 +186,18 @@ def _run(
     eccentrics: Array,
     noise: Array,
     angle_noise: Array,
-    driver: Driver,
+    driver: Array,
+    lanes: Array,
     back_emf: Array,
 ) -> tuple[Array, Array, NDArray[np.bool_]]:
     n, m, s = taps.shape
     steps, window = low.size, average.shape[1]
     speed, voltage = np.empty((n, steps)), np.empty((n, steps))
     p, i, d, filter_time, weight, weight_d, limit, back = controller
-    contradicted, memory = np.zeros(n, dtype=np.bool_), min(T / INNOVATION_MEMORY, 1.0)
+    contradicted, memory = np.zeros(n, dtype=np.bool_), min(T / INNOVATION_MEMORY_S, 1.0)
     for j in range(n):
         count_angle, eccentric = count_angles[j], eccentrics[j]
-        x, following, past, put_out = np.zeros(s), np.zeros(s), np.zeros(m), np.zeros(m)
+        x, following, past, given_out = np.zeros(s), np.zeros(s), np.zeros(m), np.zeros(m)
         angle = np.full(window + 1, count_angle * ((0.5 + 0.618034 * j) % 1.0))
         observer, place = np.zeros(by_angle.size), angle[0]
         integral = previous = rate = last = surprise = 0.0
@@ -216,10 +218,10 @@ def _run(
             integral += T * change * (reference != measured)
             speed[j, k], voltage[j, k] = x[0], given
             for q in range(m - 1, 0, -1):
-                past[q], put_out[q] = past[q - 1], put_out[q - 1]
+                past[q], given_out[q] = past[q - 1], given_out[q - 1]
             past[0] = given
-            put_out[0], last = terminal_voltage(driver, given, back_emf[j] * x[0], last, T)
-            drag = _drag(x[0], friction[j], put_out, taps_angle[j], load[j, k])
+            given_out[0], last = put_out(driver, lanes, given, back_emf[j] * x[0], last, T)
+            drag = _drag(x[0], friction[j], given_out, taps_angle[j], load[j, k])
             swept = 0.0
             following[:] = 0.0
             for a in range(s):
@@ -228,7 +230,7 @@ def _run(
                     following[a] += phi[j, a, b] * x[b]
             # Load and friction act at once, the controller's voltage after its delay.
             for q in range(m):
-                volts = put_out[q] - load[j, k] - drag
+                volts = given_out[q] - load[j, k] - drag
                 swept += taps_angle[j, q] * volts
                 for a in range(s):
                     following[a] += taps[j, q, a] * volts
@@ -246,7 +248,7 @@ def _run(
                 observer[:] = _observed(advance, by_angle, by_voltage, observer, swept, delayed)
                 innovation = observer[0] / by_angle[0]
                 surprise += memory * (innovation * innovation / variance - surprise)
-                contradicted[j] |= surprise > DISAGREE
+                contradicted[j] |= surprise > DISTRUST_RATIO
             x[:] = following
     return speed, voltage, contradicted
 

@@ -1,9 +1,9 @@
-"""Where the loop shall take its speed from: the hardware, counts differenced, or the observer.
+# SPDX-License-Identifier: Apache-2.0
+"""Choose the source of the speed: the hardware, differenced counts, or the observer.
 
-Each candidate costs in its own way: a difference over more samples makes less noise and more
-lag, the observer makes little of both while its model is right.  All are designed for, and the
-gains that reject a load best within the same margins and the same control noise tell which to take,
-of those with which every motor that may be settles.
+A difference over more samples has less noise and more lag; the observer has little of both while
+its model is right.  Gains are designed for each, and those that reject a load best within the same
+margins and the same control noise win, provided that every sampled motor settles.
 """
 
 from collections.abc import Sequence
@@ -68,32 +68,29 @@ def choose_source(estimate: Estimate, loop: Loop, **targets: Any) -> tuple[Loop,
     usual = _trial(estimate, loop, targets)
     if loop.counts_per_revolution is None:
         words = "the reported speed: the encoder's counts are not known"
-        return loop, words + _averaged(estimate, loop, usual, targets)
+        return loop, words + _remark_on_averaging(estimate, loop, usual, targets)
     # Of a speed that was recorded no window is known; of counts one sample is the shortest.
     counted = replace(
         loop, speed_source="difference", difference_window=max(loop.difference_window, 1)
     )
     longer = _longer(estimate, counted, usual, targets)
-    lacks = _lacking(estimate)
+    lacks = _object_to_observer(estimate)
     watched = None if lacks else _trial(estimate, replace(loop, speed_source="observer"), targets)
     best, unsettled = _best(usual, longer, watched)
     if best is None:
-        return loop, "the reported speed: no source allows what is asked"
+        return loop, "the reported speed: no source meets the targets"
     compared = "; ".join(
         f"{t.name} allows i = {t.integral:.3g} V/rad "
         f"at {1e3 * t.control_noise:.3g} mV of control noise"
         for t in (usual, longer, watched)
         if t is not None
     )
-    lacks += "".join(f"; not {t.name}, with which some motors do not settle" for t in unsettled)
+    lacks += "".join(f"; not {t.name}: some motors do not settle with it" for t in unsettled)
     return best.loop, f"{best.name}: {compared}{lacks}"
 
 
 def _best(*trials: Trial | None) -> tuple[Trial | None, Sequence[Trial]]:
-    """Return what to take of the usual, the longer and the observed speed, and what was better.
-
-    Had it but settled with every motor that may be.
-    """
+    """Return the best trial in which every motor settles, and the better ones rejected."""
     left = [(t, w) for t, w in zip(trials, (1.0, WORTH_WINDOW, WORTH_OBSERVER), strict=True) if t]
     passed: list[Trial] = []
     while left:
@@ -122,34 +119,35 @@ def _longer(
     return max((t for t in windows if t is not None), key=lambda t: t.integral, default=None)
 
 
-def _averaged(estimate: Estimate, loop: Loop, usual: Trial | None, targets: dict[str, Any]) -> str:
-    """Return in words what an angle without counts would allow, differenced over more samples.
+def _remark_on_averaging(
+    estimate: Estimate, loop: Loop, usual: Trial | None, targets: dict[str, Any]
+) -> str:
+    """Return a remark on the benefit of differencing an angle over more samples.
 
-    What reports the speed makes it of the angle: its window is not the controller's to choose.
+    The hardware differences the angle, so the controller cannot choose the window.
     """
     if not (loop.angle_noise and loop.difference_window and loop.reports_speed):
         return ""
     taken = (
-        f", and it is taken for the angle's difference over {loop.difference_window} of the loop's "
-        "samples"
+        f", assumed to be the angle's difference over {loop.difference_window} samples of the loop"
     )
     longer = _longer(estimate, loop, usual, targets)
     if longer is None or (usual is not None and longer.integral < WORTH_WINDOW * usual.integral):
         return taken
     window, now = longer.loop.difference_window, 0.0 if usual is None else usual.integral
     return (
-        f"{taken}, which allows i = {now:.3g} V/rad; report it differenced over {window}, and say "
+        f"{taken}, which allows i = {now:.3g} V/rad; report it differenced over {window}, and give "
         f"--difference-window {window}, for i = {longer.integral:.3g} V/rad"
     )
 
 
-def _lacking(estimate: Estimate) -> str:
-    """Return in words why the observer is not taken: the model's error shows unmodelled dynamics.
+def _object_to_observer(estimate: Estimate) -> str:
+    """Return the reason against the observer: unmodelled dynamics in the residuals.
 
-    That may move no number, and still be what rings between motor and encoder.
+    They may leave the estimates unchanged and still ring between motor and encoder.
     """
     shown = (f for f in estimate.findings if "explained_deviance" in f.evidence)
-    return next((f"; not the observer, which leans on the model: {f.message}" for f in shown), "")
+    return next((f"; not the observer, which depends on the model: {f.message}" for f in shown), "")
 
 
 def _trial(estimate: Estimate, loop: Loop, targets: dict[str, Any]) -> Trial | None:

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """How a design performs in simulation: figures of the nominal loop, and bands over the ensemble."""
 
 import math
@@ -8,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from smp_motor_control.arrays import Array
-from smp_motor_control.wheel.plausibility import LOAD
+from smp_motor_control.wheel.plausibility import LOAD_SHARE
 from smp_motor_ident.tune.case import Case
 from smp_motor_ident.tune.ensemble import SHARE
 from smp_motor_ident.tune.feedback import Feedback
@@ -53,8 +54,7 @@ class Performance:
 class Band:
     """A figure of the nominal loop, and the range of 99 % of the motors that may be."""
 
-    # value, low, high: NaN where there is none, such as a settling time of a loop that does not
-    # settle
+    # value, low, high: NaN if undefined, such as the settling time of a loop that does not settle
     value: float
     low: float
     high: float
@@ -106,7 +106,7 @@ class Settling:
 DRAWS = 300
 """Motors that the bands of a specification are over, fewer where a change takes many samples."""
 
-WORK, FEWEST = 1e6, 100
+WORK, MIN_DRAWS = 1e6, 100
 """Samples that are simulated for a specification, and least motors."""
 
 
@@ -145,20 +145,20 @@ def _runs(
 ) -> list[StepFigures]:
     """Simulate a change with every motor that may be, with counts, noise, friction and driver."""
     nominal = case.problem.plant.motors
-    drawn = case.ensemble.plant.motors.first(max(int(min(DRAWS, WORK / time.size)), FEWEST))
+    drawn = case.ensemble.plant.motors.first(max(int(min(DRAWS, WORK / time.size)), MIN_DRAWS))
     motors = drawn if case.drawn else nominal
     plant = sample(motors, loop, believed=nominal)
     shape = (len(plant), time.size)
     counted = _counted(plant, case.problem.plant)
     forward = plan.forward + case.swallowed * plan.friction
-    late = _late(case, loop, shape)
+    late = _draw_timing_errors(case, loop, shape)
     run = simulate(
         plant,
         controller,
         replace(
             plan.inputs,
             forward=forward,
-            load=_load(case, plant.motors.static_voltage, shape) + late * _change(forward),
+            load=_draw_loads(case, plant.motors.static_voltage, shape) + late * _change(forward),
             noise=_reported_noise(case, loop, shape) + late * _change(plan.reference),
             angle_noise=white(loop.angle_noise, shape, of=counted),
         ),
@@ -173,7 +173,7 @@ def _runs(
         step_figures(time, speed, volts, change)
         for speed, volts in zip(run.speed, run.voltage, strict=True)
     ]
-    # What the running loop does with another speed than the observer's was not simulated.
+    # The running loop without the observer was not simulated.
     return [
         replace(one, settling=math.nan) if other else one
         for one, other in zip(each, run.contradicted, strict=True)
@@ -191,10 +191,11 @@ def _counted(plant: Plant, nominal: Plant) -> NDArray[np.bool_]:
     return np.asarray(made | (plant.observer is not None))
 
 
-def _load(case: Case, friction: Array, shape: tuple[int, int]) -> Array:
-    """Return the load beyond the voltage with which the wheel stood before the change [V].
+def _draw_loads(case: Case, friction: Array, shape: tuple[int, int]) -> Array:
+    """Return the load beyond the voltage at rest before the change [V].
 
-    That is up to what friction holds, or as much as it may hold it with too little or too much.
+    Friction holds the wheel at rest within a range of voltages; half of the draws begin at either
+    end.
     """
     either = np.where(np.arange(shape[0]) // 2 % 2, -1.0, 1.0)
     noise = white(case.torque_noise, shape, 1)
@@ -202,8 +203,8 @@ def _load(case: Case, friction: Array, shape: tuple[int, int]) -> Array:
     return held if noise is None else held + noise
 
 
-def _late(case: Case, loop: Loop, shape: tuple[int, int]) -> Array:
-    """Return by which share of a sample each step is late, or early: any is as likely."""
+def _draw_timing_errors(case: Case, loop: Loop, shape: tuple[int, int]) -> Array:
+    """Return the timing error of each step in samples, uniformly distributed."""
     most = min(math.sqrt(3.0) * case.scatter / loop.sample_time, 1.0)
     return np.random.default_rng(3).uniform(-most, most, shape)
 
@@ -215,7 +216,7 @@ def _change(planned: Array) -> Array:
 def _reported_noise(case: Case, loop: Loop, shape: tuple[int, int]) -> Array | float:
     """Return the noise of the reported speed, with the outliers that the running loop believes.
 
-    They are of any size up to the top speed; it leaves out what no motor can change by.
+    They have any size up to the top speed; the loop rejects changes impossible for a motor.
     """
     rounding = loop.rounding**2 / 12
     noise = white(math.sqrt(max(loop.reported_noise**2 - rounding, 0.0)), shape)
@@ -223,7 +224,7 @@ def _reported_noise(case: Case, loop: Loop, shape: tuple[int, int]) -> Array | f
         return 0.0 if noise is None else noise
     motor = case.problem.plant.motors
     top = loop.supply_voltage / float(motor.a0[0])
-    load = LOAD * loop.supply_voltage + case.swallowed
+    load = LOAD_SHARE * loop.supply_voltage + case.swallowed
     believed = JUMP.value * loop.reported_noise + load / float(motor.a1[0]) * loop.sample_time
     rng = np.random.default_rng(2)
     there = rng.random(shape) < case.outliers * min(believed / top, 1.0)

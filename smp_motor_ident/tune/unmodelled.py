@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 r"""Unmodelled dynamics as a bound over frequency that the loop must bear.
 
 A motor whose response is ``G (1 + D)`` with ``|D(j w)| <= W(j w)`` keeps a loop stable that is
@@ -45,13 +46,12 @@ class UnmodelledDynamics:
 
 
 def unmodelled_dynamics(estimate: Estimate) -> UnmodelledDynamics | None:
-    """Return what an estimate leaves open of the response; None where it does not say.
+    """Return the bound of the response's model error; None if the estimate has none.
 
-    An error that is shown counts with all of its bound, up to what a resonance makes of it; where
-    more than the response itself is shown, for such a resonance, of which a band holds the mean.
-    One that merely is not excluded counts for no more than what is taken where nothing is known,
-    and below all frequencies at which the recording moved the motor as at the lowest of these:
-    masses on springs, freed, answer slower changes as one mass.
+    A significant error counts with its whole bound, up to that of a resonance; an error above the
+    response itself is a resonance, averaged over its band.  An insignificant error is limited to
+    the default bound.  Below the lowest excited frequency the bound there applies:
+    free masses on springs respond to slower changes as one mass.
     """
     error = estimate.residuals.model_error
     if error is None:

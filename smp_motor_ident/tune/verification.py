@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A drive on new gains against the design's bands, for every change of set-point.
 
 The prediction is the running loop itself on simulated motors: the nominal one and draws of all
@@ -19,7 +20,7 @@ from smp_motor_control.fields import parameters_in, settings_of
 from smp_motor_control.motor.file import MotorEntry
 from smp_motor_control.motor.hardware import DrivenMotor, DriveSettings
 from smp_motor_control.motor.parameters import COMBINATIONS, Gearbox, MotorParameters
-from smp_motor_control.parameter_file import flat
+from smp_motor_control.parameter_file import flatten
 from smp_motor_control.wheel.loop import LoopSettings, WheelLoop
 from smp_motor_ident.finding import Finding
 from smp_motor_ident.result import Estimate
@@ -44,9 +45,9 @@ DRAWS = 12
 """Motors in addition to the nominal one."""
 
 UNKNOWN = 0.1
-"""Of the samples whose voltage may be no command's: one that changed within an interval."""
+"""Largest share of samples whose voltage matches no command."""
 
-_TIME = "give the wheels' nodes processor time (scheduling_priority), and the network its quiet"
+_TIME = "raise the scheduling_priority of the wheels' nodes, and reduce the load of the network"
 
 _WHEEL = (
     "look at the curves in the report: a wheel that touches something, a battery that sags or a "
@@ -68,7 +69,7 @@ class Reading:
 
 @dataclass(frozen=True, eq=False)
 class Change:
-    """One change of set-point of one wheel: what was predicted, and what happened."""
+    """One change of set-point of one wheel: its predicted and its recorded response."""
 
     wheel: str  # whose
     name: str  # of the change in the drive
@@ -162,8 +163,8 @@ def predicted(
     """Return the wheel's speed [rad/s] in a drive from rest, shape (1 + DRAWS, k), nominal first.
 
     ``parameters`` and ``loop`` are the wheel's in ``gains.yaml`` and ``gains.json``; ``answers``
-    when the recorded drive took its samples and how long after each the motor had its answer, NaN
-    where there was none.  Rest before the first change lets the loop begin.
+    are the recorded drive's sampling times and the delays until each command acted, NaN for lost
+    ones.  The loop starts during the rest before the first change.
     """
     instants, delays = answers
     step = float(loop["sample_time"])
@@ -186,7 +187,7 @@ def _run(
     plant = DrivenMotor(entry, DriveSettings(command_timeout=math.inf), start=begin)
     plant.motor.angle = phase * entry.encoder.angle_per_count
     limit = entry.supply_voltage
-    loop = WheelLoop(settings.within(limit), entry.gearbox, entry.encoder, 1.5 * limit)
+    loop = WheelLoop(settings.clamp_to_supply(limit), entry.gearbox, entry.encoder, 1.5 * limit)
     turn = entry.gearbox.to_wheel(entry.encoder.angle_per_count)
     angle, before, arrival = np.empty(instants.size), begin, begin
     samples = zip(instants.tolist(), delays.tolist(), setpoints.tolist(), strict=True)
@@ -241,7 +242,7 @@ def change_of(
 ) -> Change:  # fmt: skip
     """Return a change from a speed ``before`` it [rad/s], with its reading and its bands."""
     moved, change = speed - before, setpoint - before
-    # What a planned change may overshoot is not held against its settling.
+    # The planned overshoot does not count as unsettled.
     tolerance = SETTLED.value + OVERSHOOT.value + SIGMAS * unsure / abs(change)
     expected = read(time, rows[0] - before, change, tolerance)
     return Change(
@@ -283,13 +284,13 @@ def judge(changes: Sequence[Change]) -> list[Finding]:
 
 
 def slow_answers(changes: Sequence[Change]) -> list[Finding]:
-    """Say it where the drive's own timing makes the design overshoot: the bands allow for that."""
+    """Report overshoot caused by the drive's own timing, for which the bands allow."""
     worst = max(changes, key=lambda one: one.excess)
     if worst.excess <= 0.0:
         return []
     text = (
-        f"{worst.wheel}: {worst.name}: samples and answers were so late that by this alone the "
-        f"design overshoots by {worst.excess:.3g} % more than it specifies"
+        f"{worst.wheel}: {worst.name}: the delays of samples and commands alone cause an overshoot "
+        f"{worst.excess:.3g} % above the specification"
     )
     return [Finding("slow_answers", "warning", text, {"excess": worst.excess}, _TIME)]
 
@@ -299,14 +300,14 @@ def disturbed(silence: float) -> list[Finding]:
     if silence <= SILENCE.value:
         return []
     evidence = {"silence": silence, "limit": SILENCE.value}
-    text = f"a wheel had no answer to its samples for {silence:.2f} s"
+    text = f"a wheel received no command for {silence:.2f} s"
     return [Finding("verification_disturbed", "refused", text, evidence, _TIME)]
 
 
 def loop_settings(parameters: Mapping[str, Any]) -> LoopSettings:
     """Return the running loop of a wheel's parameters, as ``tune`` writes them."""
     usual = {name: one.default for name, one in parameters_in(LoopSettings).items()}
-    return settings_of(LoopSettings, usual | flat(parameters))
+    return settings_of(LoopSettings, usual | flatten(parameters))
 
 
 def _motors(estimate: Estimate, supply: float) -> list[MotorEntry]:

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """One robot's wheels together: gains each or for all, and one reference for all of them."""
 
 import math

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Designs as files: the parameter file of the wheel nodes, and ``gains.json``."""
 
 import bisect
@@ -9,12 +10,12 @@ from typing import Any
 from smp_motor_control.errors import ParameterError
 from smp_motor_control.motor.hardware import DriveSettings
 from smp_motor_control.motor.model import MotorModel
-from smp_motor_control.parameter_file import written
+from smp_motor_control.parameter_file import format_parameters
 from smp_motor_control.wheel.controller import WheelSettings
 from smp_motor_control.wheel.differenced import differenced_gains
 from smp_motor_control.wheel.faults import FaultLimits
 from smp_motor_control.wheel.loop import LoopSettings
-from smp_motor_control.wheel.stop import LONGEST_STOP
+from smp_motor_control.wheel.stop import MAX_STOP_TIME_S
 from smp_motor_ident.result import plain
 from smp_motor_ident.tune.designer import Design
 from smp_motor_ident.tune.limits import JUMP
@@ -23,7 +24,7 @@ from smp_motor_ident.tune.loop import Loop
 SCHEMA = 1
 
 RESERVE = 1.25
-"""Share by which a reference may take longer to stand than computed: from full speed, at rest."""
+"""Safety factor on the computed time in which a reference stops from full speed."""
 
 
 def parameters(design: Design) -> dict[str, Any]:
@@ -56,10 +57,10 @@ def _patience(design: Design) -> dict[str, float]:
     profile.reset(float(reference.max_velocity))
     profile.set_target(0.0, sample_time)
     stop = RESERVE * (profile.duration + reference.lag + reference.doubt)
-    if stop > LONGEST_STOP:
+    if stop > MAX_STOP_TIME_S:
         raise ParameterError(
-            f"a wheel that is sampled every {sample_time:.3g} s would stand {stop:.3g} s after a "
-            f"set-point of zero, and wheel_pid takes at most {LONGEST_STOP:g} s; sample it faster"
+            f"sampled every {sample_time:.3g} s, a wheel would stop {stop:.3g} s after a set-point "
+            f"of zero; wheel_pid accepts at most {MAX_STOP_TIME_S:g} s. Sample it faster"
         )
     if stop > LoopSettings().stop_time:
         times["stop_time"] = stop
@@ -69,12 +70,12 @@ def _patience(design: Design) -> dict[str, float]:
 
 
 def silence(loop: Loop) -> float:
-    """Return the silence that a loop must bear: that of two samples lost, and a late one [s]."""
+    """Return the silence that a loop must tolerate: two lost samples and a late one [s]."""
     return 3.5 * loop.sample_time
 
 
 def slow_loop(design: Design) -> list[str]:
-    """Return what the hardware's driver must do for a loop that answers seldom."""
+    """Return required settings of the hardware's driver for a loop with a low rate."""
     needed, interval = silence(design.loop), design.loop.sample_time
     if needed <= DriveSettings().command_timeout:
         return []
@@ -125,7 +126,7 @@ def _must_turn(breakaway: float) -> dict[str, float]:
 def gains_yaml(designs: Mapping[str, Design], provenance: Iterable[str]) -> str:
     """Return the parameter file of all wheel nodes."""
     nodes = {f"/**/{wheel}/wheel_pid": parameters(design) for wheel, design in designs.items()}
-    return written(nodes, provenance)
+    return format_parameters(nodes, provenance)
 
 
 def gains_document(
@@ -155,4 +156,4 @@ _WRITTEN = (
     "method", "reason", "warnings", "gains", "margins", "robustness", "findings", "performance",
     "specification", "settling", "reference", "loop", "motor", "sensor",
 )  # fmt: skip
-"""What of a design stands in ``gains.json``, wheel quantities at the wheel."""
+"""Fields of a design in ``gains.json``; wheel quantities at the wheel."""

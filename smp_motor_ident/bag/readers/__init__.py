@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Formats of recordings: one file each, one line each in the registry."""
 
 from pathlib import Path
@@ -19,7 +20,7 @@ PACKED = (".zstd", ".zst", ".lz4")
 
 
 def open_source(path: Path, folder: Path, budget: Budget) -> Messages | Tables:
-    """Open a file by what it begins with, else by its name; ``folder`` is for unpacked copies."""
+    """Open a file by its first bytes, else by its name; ``folder`` is for unpacked copies."""
     head, plain, problem = _head(path), path, ""
     if kind := MAGIC.get(head[:4]):
         plain = folder / path.name.removesuffix(path.suffix)
@@ -28,7 +29,7 @@ def open_source(path: Path, folder: Path, budget: Budget) -> Messages | Tables:
     form = recognise(head, plain)
     try:
         if form is None:
-            raise BagError(f"{path}: {_what(path, head)}")
+            raise BagError(f"{path}: {_explain_unknown(path, head)}")
         source = form.open(plain, path.name, budget)
     except OSError as error:
         raise BagError(f"{path}: cannot be read ({error.strerror})") from None
@@ -62,7 +63,7 @@ def _head(path: Path) -> bytes:
         raise BagError(f"{path}: cannot be read ({error.strerror})") from None
 
 
-def _what(path: Path, head: bytes) -> str:
+def _explain_unknown(path: Path, head: bytes) -> str:
     if not head:
         return "is empty"
     if any(form.magic.startswith(head) for form in FORMATS if form.magic):
@@ -70,4 +71,4 @@ def _what(path: Path, head: bytes) -> str:
     if head.startswith(b"version https://git-lfs"):
         return "is a pointer of Git LFS, not the recording; run git lfs pull"
     names = ", ".join(form.name for form in FORMATS)
-    return f"is no recording of a known format ({names})"
+    return f"is not a recording of a known format ({names})"

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """CSV files as loggers, scopes and spreadsheets write them."""
 
 import csv
@@ -23,10 +24,10 @@ _WORD = r"[A-Za-z_]\w*"
 _LABEL = re.compile(
     rf"(?:^|(?<=[\s,;|]))({_WORD}(?: {_WORD})*(?=\s*[:=])|{_WORD})\s*[:=,;\s]\s*(?=[-+.\d])"
 )
-"""What a serial plotter's or a debug output's rows have before every number."""
+"""Label before each number in the rows of a serial plotter or debug output."""
 _UNIT = re.compile(r"(?<=\d) ?([A-Za-z%°µ][\w%°µ/]*)(?=\s*(?:[,;|]|$))")
-"""And what may stand behind one: ``Speed: 33 rpm, Duty: 40%``."""
-_LONGEST = 4096  # characters of a row that may have labels
+"""Unit behind a labelled number: ``Speed: 33 rpm, Duty: 40%``."""
+_MAX_LABELLED_ROW = 4096  # characters of a row that may have labels
 
 
 class _CsvFile(Tables):
@@ -54,7 +55,7 @@ class _CsvFile(Tables):
         rows = [_row(self._lines[k], self._separator) for k in seen]
         if self._separator == " ":
             rows = [
-                self._spaced(self._lines[k], row, len(rows[len(rows) // 2]))
+                self._split_names(self._lines[k], row, len(rows[len(rows) // 2]))
                 for k, row in zip(seen, rows)
             ]
         self._grid = grid.head(rows, str(path))
@@ -68,14 +69,14 @@ class _CsvFile(Tables):
         self._numeric = tuple(n for n in self._grid.names if n in known or n in self._words)
 
     def channels(self) -> list[Channel]:
-        """Return the one table, without its columns of words but those that tell motors apart."""
+        """Return the one table, without columns of words except those that name motors."""
         units, words = self._grid.units, self._words
         return [Channel(0, "", "", TABLE, fields=self._numeric, units=units, words=words)]
 
     def _numbered(self) -> dict[str, tuple[str, ...]]:
-        """Put numbers for the words of columns that tell motors apart; return the words."""
+        """Replace the words of columns that name motors by numbers; return the words."""
         found = {}
-        # Words of one letter are such of any column
+        # Single letters may be words of any column
         for j in [j for j, name in enumerate(self._grid.names) if tells_motors(name, "A")]:
             rows = {k: _row(s, self._separator) for k, s in enumerate(self._lines)}
             body = {k: row for k, row in rows.items() if k >= self._first and j < len(row)}
@@ -95,7 +96,7 @@ class _CsvFile(Tables):
         self._check(fields, names)
         use = [names.index(name) for name in fields]
         body = self._lines[self._first :]
-        fast = self._fast(body, use)
+        fast = self._read_plain_numbers(body, use)
         if fast is not None:
             return Table(None, None, dict(zip(fields, fast)))
         lines = [k for k, s in enumerate(body, self._first + 1) if not s.startswith("#")]
@@ -104,7 +105,7 @@ class _CsvFile(Tables):
         columns = dict(zip(fields, values))
         return Table(None, None, columns, findings=findings, exact=frozenset(dates))
 
-    def _fast(self, body: list[str], use: list[int]) -> list[NDArray[Any]] | None:
+    def _read_plain_numbers(self, body: list[str], use: list[int]) -> list[NDArray[Any]] | None:
         """Return columns of plain numbers; None where cells need a closer look."""
         try:
             values = np.loadtxt(
@@ -123,11 +124,11 @@ class _CsvFile(Tables):
     def _labels(self, seen: list[int]) -> tuple[list[str], list[int]]:
         """Take the labels off rows that have one before every number; return them and such rows."""
         usual = self._lines[seen[len(seen) // 2]]
-        if len(usual) > _LONGEST:
+        if len(usual) > _MAX_LABELLED_ROW:
             return [], seen
         labels: list[str] = _LABEL.findall(usual)
         alike = [k for k in seen if labels and _LABEL.findall(self._lines[k]) == labels]
-        bare = [_bare(self._lines[k]) for k in alike]
+        bare = [_strip_labels(self._lines[k]) for k in alike]
         units = [_UNIT.search(cell) for cell in re.split("[,;|]", _LABEL.sub("", usual))]
         if len(units) == len(labels):
             labels = [f"{one} [{unit[1]}]" if unit else one for one, unit in zip(labels, units)]
@@ -135,12 +136,12 @@ class _CsvFile(Tables):
         names = (["time"] if bare and _TIME.match(bare[0].strip()) else []) + labels
         if len(alike) <= len(seen) / 2 or widths != {len(names)}:
             return [], seen
-        self._lines = [_bare(line) for line in self._lines]
+        self._lines = [_strip_labels(line) for line in self._lines]
         return names, alike
 
     @staticmethod
-    def _spaced(line: str, row: list[str], width: int) -> list[str]:
-        """Return a row of names whose words are closer than its columns; none where that fails."""
+    def _split_names(line: str, row: list[str], width: int) -> list[str]:
+        """Split a row of names at wider gaps than between words; return none if that fails."""
         if len(row) <= width or grid.is_data(row):
             return row
         apart = re.split(r"\s{2,}", line.strip())
@@ -167,12 +168,12 @@ class _CsvFile(Tables):
 
 
 def _without_brackets(line: str) -> str:
-    """Return a row of a matrix or of lists without what stands around it."""
+    """Return a row of a matrix or of lists without its brackets."""
     text = line.strip().removesuffix(";").removesuffix("]")
     return text[1:] if text[:1] == "[" and text[1:2].strip("0123456789.+-") == "" else text
 
 
-def _bare(line: str) -> str:
+def _strip_labels(line: str) -> str:
     """Return the numbers of a row of labels."""
     return _UNIT.sub("", _LABEL.sub("", line))
 
@@ -187,7 +188,7 @@ def _row(line: str, separator: str) -> list[str]:
 
 
 def _is_quoted_row(line: str) -> bool:
-    """Return whether a whole row is in quotes, which would make one cell of it."""
+    """Return whether a whole row is in quotes, and would be read as one cell."""
     text = line.strip()
     if text.count('"') != 2 or not (text[0] == text[-1] == '"'):
         return False
@@ -195,7 +196,7 @@ def _is_quoted_row(line: str) -> bool:
 
 
 def _separator(lines: list[str]) -> str:
-    """Return what divides most lines, and that into numbers; a comma may be a decimal one."""
+    """Return the separator that splits most lines into numbers; a comma may be decimal."""
     usual = lines[len(lines) // 2 :]
     likely = [c for c in ";\t|," if sum(c in line for line in usual) > 2 / 3 * len(usual)]
     likely += [" "] if any(" " in line.strip() for line in usual) else []
@@ -204,7 +205,7 @@ def _separator(lines: list[str]) -> str:
 
 
 def _text(path: Path) -> str:
-    """Return a file's text in whatever spreadsheets and scopes write."""
+    """Return a file's text in any encoding that spreadsheets and scopes write."""
     data = path.read_bytes()
     if data[:2] in (b"\xff\xfe", b"\xfe\xff"):
         return data.decode("utf-16", "replace")
@@ -212,8 +213,8 @@ def _text(path: Path) -> str:
         return data.decode("utf-8-sig")
     except UnicodeDecodeError:
         if b"\0" in data:
-            raise BagError(f"{path}: is no text") from None
-        return data.decode("latin-1")  # a degree sign in an old code page
+            raise BagError(f"{path}: is not text") from None
+        return data.decode("latin-1")  # such as a degree sign in an old code page
 
 
 FORMAT = Format("CSV", (".csv", ".tsv", ".txt", ".dat", ".log"), b"", _CsvFile)

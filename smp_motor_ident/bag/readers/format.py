@@ -1,4 +1,5 @@
-"""What every format gives, and what the registry knows of it."""
+# SPDX-License-Identifier: Apache-2.0
+"""Define the interface of a format and its entry in the registry."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
@@ -17,16 +18,13 @@ from smp_motor_ident.finding import Finding
 
 
 def check_width(count: int, name: str, what: str = "columns") -> None:
-    """Refuse what has more columns or topics than any log of a robot."""
+    """Raise `BagError` for more columns or topics than a robot's log can have."""
     if count > WIDEST.value:
-        raise BagError(
-            f"{name}: has more than {WIDEST.value:.0f} {what}, as no log of a robot; keep those of "
-            "the motors"
-        )
+        raise BagError(f"{name}: has more than {WIDEST.value:.0f} {what}; keep those of the motors")
 
 
 class Source(ABC):
-    """One opened file; ``problems`` fills while it is read: everything that was lost."""
+    """One opened file; ``problems`` collects losses while it is read."""
 
     def __init__(self, path: Path, name: str) -> None:
         self.path = path
@@ -42,7 +40,7 @@ class Source(ABC):
 
 
 class Messages(Source):
-    """A file of serialized messages, whose channels a walk over all of them finds."""
+    """A file of serialized messages, with channels found by reading all of them."""
 
     def __init__(self, path: Path, name: str, budget: Budget) -> None:
         super().__init__(path, name)
@@ -63,7 +61,7 @@ class Messages(Source):
 
     @abstractmethod
     def batches(self, wanted: Callable[[Channel], bool]) -> Iterator[list[Batch]]:
-        """Yield the messages that stand together in the file, channel by channel."""
+        """Yield blocks of consecutive messages, channel by channel."""
 
 
 class Tables(Source):
@@ -129,12 +127,11 @@ class ColumnFile(Tables):
 
 @dataclass(frozen=True)
 class Format:
-    """A kind of file: how it is recognised, and what opens it."""
+    """A kind of file: how to recognise and open it."""
 
     name: str  # for messages
     suffixes: tuple[str, ...]  # names of such files end so, in lower case
-    # How they begin; a file that begins otherwise is none, whatever its name.  Empty for plain
-    # text, which only its name tells.
+    # First bytes, required whatever the name; empty for plain text, recognised by name only.
     magic: bytes
     # ``open(path, name, budget)``; raises `BagError`
     open: Callable[[Path, str, Budget], Messages | Tables]

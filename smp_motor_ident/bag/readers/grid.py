@@ -1,4 +1,5 @@
-"""Rows of cells as spreadsheets and loggers write them: names, units, numbers, times."""
+# SPDX-License-Identifier: Apache-2.0
+"""Parse rows of cells of spreadsheets and loggers: names, units, numbers, times."""
 
 import re
 from array import array
@@ -29,15 +30,15 @@ _ISO = re.compile(
     r"(?:(\d{4}-\d\d-\d\d)[T _.])?(\d\d?:\d\d:\d\d(?:[.,]\d{1,9})?) ?(Z|[+-]\d\d:?\d\d)?"
 )
 _BRACKETS = re.compile(r"\s*[\[(]([^\])]*)[\])]\s*$")
-_SEEN = 60  # rows that are looked at to tell names from numbers
-_SOME = 1000  # cells of a row, and rows without a number, behind which no more are looked at
-_LONGEST = 200  # characters of a column's name
+_EXAMINED_ROWS = 60  # rows examined to tell names from numbers
+_MAX_EXAMINED = 1000  # examined cells of a row; examined rows without a number
+_MAX_NAME_LENGTH = 200  # characters of a column's name
 _YEARS = range(1678, 2262)  # that nanoseconds in 64 bits can tell
 
 
 @dataclass
 class Grid:
-    """Where the numbers of a table begin, and what its columns are called."""
+    """First row of numbers of a table, and the names of its columns."""
 
     names: list[str]
     units: dict[str, str]
@@ -51,8 +52,8 @@ class Grid:
 
 
 def head(rows: Sequence[Row], where: str) -> Grid:
-    """Tell the row of names, and of units, from those of numbers."""
-    seen = rows[:_SEEN]
+    """Find the rows of names, of units and of numbers."""
+    seen = rows[:_EXAMINED_ROWS]
     data = [*map(is_data, seen), True]
     first = next((k for k in range(len(seen)) if data[k] and data[k + 1]), None)
     if first is None:
@@ -71,7 +72,11 @@ def head(rows: Sequence[Row], where: str) -> Grid:
     columns: dict[str, int] = {}
     for k in range(width):
         text = str(named[k]).strip() if k < len(named) and not _empty(named[k]) else f"c{k + 1}"
-        text = text[:_LONGEST] if text[:_LONGEST] not in columns else f"{text[:_LONGEST]}_{k + 1}"
+        text = (
+            text[:_MAX_NAME_LENGTH]
+            if text[:_MAX_NAME_LENGTH] not in columns
+            else f"{text[:_MAX_NAME_LENGTH]}_{k + 1}"
+        )
         columns[text] = k
         bracket = _BRACKETS.search(text)
         unit = written_unit(given[k] if k < len(given) else "") or (
@@ -83,7 +88,7 @@ def head(rows: Sequence[Row], where: str) -> Grid:
 
 
 def numeric(names: Sequence[str], rows: Sequence[Row]) -> tuple[str, ...]:
-    """Return the names of the columns that are not of words alone."""
+    """Return the names of the columns with numbers."""
     filled = [[row[k] for row in rows if k < len(row)] for k in range(len(names))]
     filled = [[cell for cell in column if not _empty(cell)] for column in filled]
     return tuple(
@@ -92,10 +97,14 @@ def numeric(names: Sequence[str], rows: Sequence[Row]) -> tuple[str, ...]:
 
 
 def words(cells: Sequence[str]) -> tuple[str, ...]:
-    """Return the words of a column, but for stray ones; none of numbers, states or one word."""
+    """Return the words of a column without outliers; none for numbers, states or one word."""
     counts = Counter(filter(None, cells))
     usual = tuple(c for c, n in counts.items() if n > STRAY_ROWS.value * len(cells))
-    if len(usual) < 2 or any(map(_sound, usual)) or all(c.lower() in _WORDS for c in usual):
+    if (
+        len(usual) < 2
+        or any(map(_is_readable_cell, usual))
+        or all(c.lower() in _WORDS for c in usual)
+    ):
         return ()
     return usual
 
@@ -119,12 +128,12 @@ def is_data(row: Row) -> bool:
 
 
 def share_of_numbers(row: Row) -> float:
-    """Return how many of a row's cells that are not empty are numbers."""
-    sound = [_sound(cell) for cell in row[:_SOME] if not _empty(cell)]
+    """Return the share of numbers among a row's cells that are not empty."""
+    sound = [_is_readable_cell(cell) for cell in row[:_MAX_EXAMINED] if not _empty(cell)]
     return sum(sound) / max(len(sound), 1)
 
 
-def _sound(cell: Any) -> bool:
+def _is_readable_cell(cell: Any) -> bool:
     return _readable(cell) and not (isinstance(cell, str) and cell.strip().lower() in _WORDS)
 
 
@@ -177,15 +186,15 @@ def nanoseconds(cell: Any) -> int:
 def columns(
     rows: Sequence[Row], use: Sequence[int], names: Sequence[str], where: str, lines: Sequence[int]
 ) -> tuple[list[NDArray[Any]], list[Finding], set[str]]:
-    """Return columns as numbers, what was found, and the names of those that are dates [ns].
+    """Return columns as numbers, findings, and the names of the columns of dates [ns].
 
-    Rows that are no rows of numbers, such as a name in their midst, are left out with a finding;
+    Rows without numbers, such as a repeated header, are left out with a finding;
     ``lines`` are the rows' for messages.
     """
     kept = array("d")
     stray: list[int] = []
     sound_rows: list[Row] = []
-    last = 0  # that is one of numbers
+    last = 0  # row of numbers
     for k, row in enumerate(rows):
         if all(_empty(cell) for cell in row):
             continue
@@ -195,16 +204,16 @@ def columns(
             last = k
         except (ValueError, OverflowError):
             stray.append(k)
-            if len(stray) > _SOME and not kept:
+            if len(stray) > _MAX_EXAMINED and not kept:
                 break
-    # Notes that follow the table are no part of it.
+    # Notes below the table do not belong to it.
     inside = [k for k in stray if k < last or 2 * len(rows[k]) > len(rows[last])]
     if len(inside) > STRAY_ROWS.value * (len(sound_rows) + len(inside)):
         k = inside[0]
-        raise BagError(f"{where}: line {lines[k]}, {_culprit(rows[k], use, names)}")
+        raise BagError(f"{where}: line {lines[k]}, {_describe_bad_cell(rows[k], use, names)}")
     findings = []
     if stray:
-        text = f"{where}: {len(stray)} rows that are no numbers were left out, the first in line "
+        text = f"{where}: {len(stray)} rows without numbers were left out, the first in line "
         findings.append(found("stray_rows", f"{text}{lines[stray[0]]}", "warning"))
     values = np.array(kept).reshape(len(sound_rows), len(use))
     exact = [_whole(sound_rows, j, values[:, n]) for n, j in enumerate(use)]
@@ -213,7 +222,7 @@ def columns(
 
 
 def _whole(rows: Sequence[Row], j: int, column: NDArray[Any]) -> tuple[NDArray[Any], bool]:
-    """Return a column, as integers where float64 would round it; and whether it is of times."""
+    """Return a column, as integers if float64 would round it, and whether it holds times."""
     if not column.size or not np.isfinite(column).all():
         return column, False
     first = rows[0][j]
@@ -228,11 +237,11 @@ def _whole(rows: Sequence[Row], j: int, column: NDArray[Any]) -> tuple[NDArray[A
     return column, False
 
 
-def _culprit(row: Row, use: Sequence[int], names: Sequence[str]) -> str:
-    """Return which cell is no number."""
+def _describe_bad_cell(row: Row, use: Sequence[int], names: Sequence[str]) -> str:
+    """Return a remark on the cell that is not a number."""
     for name, j in zip(names, use):
         try:
             number(row[j] if j < len(row) else None)
         except (ValueError, OverflowError):
-            return f"column {name!r}: {str(row[j])[:40]!r} is no number"
-    return "is no row of numbers"
+            return f"column {name!r}: {str(row[j])[:40]!r} is not a number"
+    return "is not a row of numbers"

@@ -1,7 +1,8 @@
+# SPDX-License-Identifier: Apache-2.0
 """JSON logs: rows of objects, objects of columns, JSON lines, and WPILib's SysId.
 
 SysId and its forerunner frc-characterization keep lists of rows by the name of the test
-(``slow-forward`` and the like); what their columns are follows from the number of them.
+(``slow-forward`` and the like); the number of columns determines their meaning.
 
 References
 ----------
@@ -39,7 +40,7 @@ _FORMS = {
     (False, 9): (*_OLD, *_SIDES),
     (False, 10): (*_OLD, *_SIDES, "gyro"),
 }
-"""Names of the columns: of SysId, or of its forerunner; and by how many there are."""
+"""Names of the columns by their number: of SysId, or of its forerunner."""
 _UNITS = {
     **{"rotations": "rev", "radians": "rad", "degrees": "deg"},
     **{"meters": "m", "feet": "ft", "inches": "in"},
@@ -71,7 +72,7 @@ def _open(path: Path, name: str, budget: Budget) -> ColumnFile:
 
 
 def _parsed(text: str, name: str, *, whole: bool) -> tuple[Any, str]:
-    """Return what a text holds and what is amiss; lines of JSON may be called ``.json``, too."""
+    """Return the content of a text and a remark on errors; accept JSON lines in ``.json``."""
     reason = ""
     if whole:
         try:
@@ -90,7 +91,7 @@ def _lines(text: str, name: str) -> tuple[list[Any], str]:
     try:
         return json.loads(f"[{','.join(lines)}]"), ""
     except ValueError:
-        pass  # not all of them are
+        pass  # not every file with this name is one document
     rows, bad = [], 0
     for line in lines:
         try:
@@ -100,8 +101,8 @@ def _lines(text: str, name: str) -> tuple[list[Any], str]:
             if bad > 1 + STRAY_ROWS.value * len(lines):
                 break
     if not rows or bad > max(1, STRAY_ROWS.value * len(rows)):
-        raise ValueError(f"{bad} of {bad + len(rows)} lines are no JSON")
-    return rows, f"{name}: {bad} lines that are no JSON were left out" if bad else ""
+        raise ValueError(f"{bad} of {bad + len(rows)} lines are not JSON")
+    return rows, f"{name}: {bad} lines that are not JSON were left out" if bad else ""
 
 
 def _columns(
@@ -165,11 +166,10 @@ def _flat(prefix: str, row: Any, depth: int) -> Iterator[tuple[str, Any]]:
 def _sysid(
     document: Mapping[str, Any], name: str
 ) -> tuple[dict[str, NDArray[Any]], dict[str, str], float]:
-    """Return the columns of all tests, one behind another, their units and the wheel's radius.
+    """Return the joined columns of all tests, their units and the wheel's radius.
 
-    Where the file tells ``unitsPerRotation``, its rows are in rotations (in SysId always, in its
-    forerunner since April 2020), which that number makes ``units`` of; elsewhere they are in
-    ``units``.
+    With ``unitsPerRotation`` the rows are in rotations (in SysId always, in its forerunner since
+    April 2020), which that number converts to ``units``; otherwise they are in ``units``.
     """
     every = chain.from_iterable(document.get(test) or [] for test in _TESTS)
     rows = [row for row in every if isinstance(row, list) and len(row) >= 4]

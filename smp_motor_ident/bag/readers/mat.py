@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """MATLAB files: version 4 to 7.2 by scipy, version 7.3 by h5py where it is installed.
 
 Vectors and the columns of matrices become columns of one table per length, fields of structures
@@ -14,7 +15,7 @@ from smp_motor_ident.bag.storage import found
 from smp_motor_ident.bag.unpack import Budget
 from smp_motor_ident.errors import BagError
 
-_TOLD = 4  # objects that are named in a message
+_MAX_NAMED_OBJECTS = 4  # objects named in a message
 
 
 def _open(path: Path, name: str, budget: Budget) -> ColumnFile:
@@ -31,8 +32,8 @@ def _open(path: Path, name: str, budget: Budget) -> ColumnFile:
 
 
 def _advice(objects: list[str]) -> str:
-    """Return what to do about objects, which MATLAB alone can open."""
-    some = ", ".join(list(dict.fromkeys(objects))[:_TOLD])
+    """Return advice on objects, which only MATLAB can open."""
+    some = ", ".join(list(dict.fromkeys(objects))[:_MAX_NAMED_OBJECTS])
     return (
         "holds MATLAB objects, such as a timeseries or a Simulink Dataset, which only MATLAB can "
         f"read: {some}; save its Time and Data as arrays there: "

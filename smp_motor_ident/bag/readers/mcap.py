@@ -1,4 +1,5 @@
-"""MCAP files, whole or cut off at any byte: a walk over records that loses nothing silently.
+# SPDX-License-Identifier: Apache-2.0
+"""Read MCAP files, whole or cut off at any byte, and report every loss.
 
 The walk hands out positions for bulk decoding instead of one Python object per message.
 """
@@ -42,7 +43,7 @@ class _McapFile(Messages):
                 self._add_channel(channel)
 
     def declared(self) -> dict[str, int] | None:
-        """Return what the summary counts."""
+        """Return the messages per topic according to the summary."""
         if self._summary is None:
             return None
         counts: Counter[str] = Counter()
@@ -83,7 +84,7 @@ class _McapFile(Messages):
     def _top_level(
         self, file: BinaryIO, start: int, length: int, wanted: Callable[[Channel], bool]
     ) -> list[Batch]:
-        """Return messages that stand outside of chunks, of a block of the file."""
+        """Return the messages outside of chunks in a block of the file."""
         file.seek(start)
         data = file.read(max(_BLOCK, length + 9))
         positions, end = self._walk(data)
@@ -93,7 +94,7 @@ class _McapFile(Messages):
     def _chunk(
         self, body: bytes, start: int, whole: bool, wanted: Callable[[Channel], bool]
     ) -> list[Batch]:
-        """Return the messages of a chunk; of one that is cut off, those that are there."""
+        """Return the messages of a chunk, or the readable ones of a chunk that is cut off."""
         try:
             head = records.read_chunk(body)
         except records.DAMAGE:
@@ -110,7 +111,7 @@ class _McapFile(Messages):
             return []
         positions, end = self._walk(data)
         if not whole:
-            self._cut(start, f"inside a chunk of which {len(positions)} messages could be read")
+            self._cut(start, f"inside a chunk; {len(positions)} of its messages could be read")
         elif end != len(data):
             self._amiss(
                 f"the chunk at byte {start} ends inside a record; "
@@ -119,7 +120,7 @@ class _McapFile(Messages):
         return self._split(data, positions, wanted)
 
     def _walk(self, data: bytes) -> tuple[list[int], int]:
-        """Take in what is defined; return where messages begin and the last whole record ends."""
+        """Read definitions; return where messages begin and where the last whole record ends."""
         unpack, end, pos = records.HEAD.unpack_from, len(data), 0
         messages: list[int] = []
         while end - pos >= 9:
@@ -168,7 +169,7 @@ class _McapFile(Messages):
         return batches
 
     def _define(self, op: int, body: bytes) -> None:
-        """Take in a schema or a channel; a damaged one is reported by its messages."""
+        """Store a schema or a channel; a damaged one is reported by its messages."""
         try:
             if op == records.SCHEMA:
                 schema = records.read_schema(body)
@@ -192,7 +193,7 @@ class _McapFile(Messages):
         )
 
     def _skippable(self, start: int, wanted: Callable[[Channel], bool]) -> bool:
-        """Return whether the index says that a chunk has nothing of what is wanted."""
+        """Return whether a chunk has no wanted message according to the index."""
         index = self._chunks.get(start)
         if index is None or not index.channels:
             return False
@@ -204,7 +205,7 @@ class _McapFile(Messages):
         return f" with {index.messages} messages" if index is not None and index.channels else ""
 
     def _resume(self, file: BinaryIO, start: int) -> bool:
-        """Go to the next chunk that the index knows behind a damaged place."""
+        """Continue at the next indexed chunk after a damaged place."""
         beyond = [offset for offset in self._chunks if offset > start]
         self._cut(start, "" if not beyond else f"; reading went on at byte {min(beyond)}")
         if beyond:

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Records that describe an MCAP file, in the layout of https://mcap.dev/spec.
 
 A record that ends early, or whose text is not UTF-8, raises one of `DAMAGE`.

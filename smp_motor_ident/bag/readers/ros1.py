@@ -1,4 +1,5 @@
-"""ROS 1 bags of version 2.0: a walk over their records, whole or cut off, indexed or not.
+# SPDX-License-Identifier: Apache-2.0
+"""Read ROS 1 bags of version 2.0, whole or cut off, indexed or not.
 
 The format is that of http://wiki.ros.org/Bags/Format/2.0; rosbags reads the records' heads.
 """
@@ -84,7 +85,7 @@ class _Ros1Bag(Messages):
         yield batches
 
     def _connect(self, header: Any, body: bytes) -> None:
-        """Take in a connection: its topic, and the definition of its type."""
+        """Store a connection: its topic, and the definition of its type."""
         key = header.get_uint32("conn")
         if key in self._channels:
             return

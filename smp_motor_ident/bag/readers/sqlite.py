@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """SQLite bags of every rosbag2 schema, whole or cut off."""
 
 import shutil
@@ -18,7 +19,7 @@ from smp_motor_ident.errors import BagError
 
 MAGIC = b"SQLite format 3\0"
 _ROWS = 8192
-_ROW = 64  # bytes that a row takes at least, here and there
+_ROW = 64  # minimum size of a row [byte]
 _TABLES = ("topics", "messages", "message_definitions")
 _BEFORE = -(2**63)
 _BLOCK = 1 << 25
@@ -39,10 +40,9 @@ class _SqliteFile(Messages):
             raise BagError(f"{self.name}: not a readable bag ({reasons})") from None
 
     def _with_journal(self) -> Path:
-        """Return the file, or where a journal lies beside it a copy of both.
+        """Return the file, or a copy with its journal applied if one lies next to it.
 
-        A recorder that died leaves its last messages there, and SQLite must write to
-        bring them home.
+        A killed recorder leaves its last messages there, and SQLite must write to apply them.
         """
         beside = (self.path.with_name(self.path.name + end) for end in ("-wal", "-journal"))
         journals = [path for path in beside if path.is_file() and path.stat().st_size]
@@ -57,7 +57,7 @@ class _SqliteFile(Messages):
     def _connect(self, path: Path) -> sqlite3.Connection:
         mode = "immutable=1" if path == self.path else "mode=rw"
         database = sqlite3.connect(f"file:{quote(str(path.resolve()))}?{mode}", uri=True)
-        if hasattr(database, "setlimit"):  # limit 0 is that of a blob's length
+        if hasattr(database, "setlimit"):  # limit 0 is the length of a blob
             database.setlimit(0, path.stat().st_size + (1 << 20))
         database.text_factory = lambda text: text.decode("utf-8", "replace")
         size = path.stat().st_size
@@ -69,7 +69,7 @@ class _SqliteFile(Messages):
         if path == self.path and size < pages * page:
             self._amiss(f"cut off at byte {size} of {pages * page} that it had")
             self._cut_off = True
-            # With this, SQLite reads a file that is shorter than its head says.
+            # With this, SQLite reads a file shorter than stated in its header.
             database.execute("PRAGMA writable_schema=ON")
         return database
 
@@ -79,8 +79,8 @@ class _SqliteFile(Messages):
             raise sqlite3.DatabaseError("it has no table of topics")
         query = "SELECT name FROM sqlite_master WHERE type != 'table' AND sql IS NOT NULL"
         views = [name for (name,) in self._database.execute(query) if str(name).lower() in _TABLES]
-        if views:  # which may have rows without end
-            raise sqlite3.DatabaseError(f"its {views[0]} are no table")
+        if views:  # views may have endless rows
+            raise sqlite3.DatabaseError(f"its {views[0]} are not a table")
         definitions: dict[str, tuple[str, str]] = {}
         if self._database.execute("PRAGMA table_info(message_definitions)").fetchall():
             query = "SELECT topic_type, encoded_message_definition, encoding"
@@ -122,7 +122,7 @@ class _SqliteFile(Messages):
             yield from self._salvaged(asked, last)
 
     def _reads(self, asked: dict[int, Channel]) -> Iterator[tuple[int, list[Batch]]]:
-        """Yield the last row that is read, and some rows by topic."""
+        """Yield the number of the last row, and a block of rows by topic."""
         ids = ",".join(str(key) for key in asked)
         among = "" if len(asked) == len(self._topics) else f"AND topic_id IN ({ids}) "
         query = (
@@ -135,10 +135,10 @@ class _SqliteFile(Messages):
             yield last, self._split(rows, asked)
 
     def _rows(self, query: str, last: int) -> list[tuple[int, int, int, bytes]]:
-        """Return the next rows; spoilt pages may give the same bytes to many of them."""
+        """Return the next rows; damaged pages may give the same bytes to many of them."""
         rows, size = [], 0
         for row in self._database.execute(query, (last,)):
-            if not isinstance(row[0], int) or row[0] <= last:  # or the same would be read for ever
+            if not isinstance(row[0], int) or row[0] <= last:  # avoid an endless loop
                 raise sqlite3.DatabaseError("its rows are out of order")
             last = row[0]
             rows.append(row)
@@ -149,7 +149,7 @@ class _SqliteFile(Messages):
         return rows
 
     def _salvaged(self, asked: dict[int, Channel], last: int) -> Iterator[list[Batch]]:
-        """Yield what single pages still hold behind the last row that the tree gave."""
+        """Yield rows of single pages after the last row of the tree."""
         for rows in salvage(self._path_read):
             wanted = [row for row in rows if row[0] > last and row[1] in asked]
             self._budget.take(sum(len(row[3]) for row in wanted))

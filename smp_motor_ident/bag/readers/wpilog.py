@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """WPILib data logs (``.wpilog``): entries by name, each with its own times.
 
 The format is that of github.com/wpilibsuite/allwpilib, ``wpiutil/doc/datalog.adoc``, version 1.0:
@@ -22,7 +23,7 @@ _KINDS = {"double": "<f8", "float": "<f4", "int64": "<i8", "boolean": "u1"}
 
 @dataclass
 class _Entry:
-    """One entry: its type, and where its records are."""
+    """One entry: its type, and the positions of its records."""
 
     name: str
     kind: str
@@ -39,11 +40,11 @@ class _Wpilog(Tables):
         self._data = path.read_bytes()
         self._entries: dict[str, _Entry] = {}
         if len(self._data) < 12 or self._data[7] != 1:
-            raise BagError(f"{name}: is no data log of version 1")
+            raise BagError(f"{name}: is not a data log of version 1")
         self._walk(12 + int.from_bytes(self._data[8:12], "little"))
 
     def _walk(self, at: int) -> None:
-        """Note where every record of a number is."""
+        """Store the position of every numeric record."""
         data, active, end = self._data, dict[int, _Entry](), len(self._data)
         while at < end:
             sizes = data[at]

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Excel workbooks by openpyxl, cell by cell as Excel shows them."""
 
 import json
@@ -12,7 +13,7 @@ from smp_motor_ident.errors import BagError
 
 
 def _open(path: Path, name: str, budget: Budget) -> ColumnFile:
-    """Read the sheet of a workbook that has most rows of numbers, the first of several."""
+    """Read the first sheet with the largest number of rows of numbers."""
     reason = f"{name}: holds no sheet"
     tables: list[tuple[grid.Grid, list[list[Any]]]] = []
     head, answer = apart.read("Excel", path, name, budget)

@@ -1,4 +1,5 @@
-"""Gains for loops that others run: one file a target, in its own units and arithmetic."""
+# SPDX-License-Identifier: Apache-2.0
+"""Export gains to other loops: one file per target, in its own units and arithmetic."""
 
 import math
 from collections.abc import Mapping
@@ -35,7 +36,7 @@ FORMATS: Mapping[str, Format] = {
 def export(
     name: str, estimates: Mapping[str, Estimate], loops: Mapping[str, Loop], **targets: Any
 ) -> tuple[str, dict[str, Check]]:
-    """Design for a target's loop and return its text, with what it does there."""
+    """Design for a target's loop and return its parameters as text, with their effect."""
     target = FORMATS[name]
     sets: Sets = "one" if target.one_set else "each"
     asked = {**target.targets, **targets}

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Arduino PID_v1: PWM of wheel rad/s, proportional on error.
 
 References

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """linorobot2: PWM of wheel RPM, every 20 ms, one set for all wheels.
 
 References

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """RoboClaw: velocity PID with QPPS, 16.16 fixed point.
 
 References

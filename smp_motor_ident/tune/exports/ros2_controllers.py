@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """ros2_controllers: ``pid_controller`` with the gains of control_toolbox, Jazzy.
 
 References
@@ -5,14 +6,14 @@ References
 control.ros.org/jazzy: ros2_controllers 4.42, pid_controller (src/pid_controller.yaml, src/
 pid_controller.cpp: the feed-forward is added after the clamp); control_toolbox of Jazzy,
 src/pid.cpp, ``compute_command``. The integral is forward Euler and used one step later, as in the
-running loop of this package; back-calculation adds ``T / tracking_time_constant`` of what the clamp
-took.
+running loop of this package; back-calculation adds ``T / tracking_time_constant`` of the clamped
+excess.
 """
 
 import math
 from collections.abc import Mapping
 
-from smp_motor_control.parameter_file import written
+from smp_motor_control.parameter_file import format_parameters
 from smp_motor_control.pid import Pid, PidGains
 from smp_motor_ident.tune.designer import Design
 from smp_motor_ident.tune.exports.target import Format, Gains, rounded
@@ -60,7 +61,7 @@ def _render(designs: Mapping[str, Design], gains: Mapping[str, Gains]) -> str:
         },
     }
     manager = {"update_rate": rate, "pid_controller": {"type": "pid_controller/PidController"}}
-    return written({"controller_manager": manager, "pid_controller": parameters})
+    return format_parameters({"controller_manager": manager, "pid_controller": parameters})
 
 
 FORMAT = Format(

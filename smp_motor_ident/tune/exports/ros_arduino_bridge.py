@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """ros_arduino_bridge: integers, ticks per interval of 33 ms, one set for both wheels.
 
 References
@@ -10,7 +11,7 @@ base_controller.py: the node sends its own ``Kp``, ``Kd``, ``Ki``, ``Ko`` over t
 firmware.
 
 ``Kd (input - input_before)`` is a product of 16 bits on an AVR: ``Kd`` stays so small that a wheel
-blocked at full speed does not overflow it. It is a velocity algorithm: what is called ``Kp``
+blocked at full speed does not overflow it. It is a velocity algorithm: its ``Kp``
 integrates, ``Kd`` is proportional action on the measurement, ``Ki`` would integrate twice and stays
 0.
 """
@@ -43,7 +44,7 @@ def _convert(design: Design) -> Gains:
     integral = design.feedback.i * T * scale
     proportional = max(design.feedback.p - design.feedback.i * T, 0.0) * scale
     largest = min(LARGEST, INT16 / (top_speed(design) * ticks(loop) * T))
-    Ko = _divisor(integral, proportional, largest)
+    Ko = _find_divisor(integral, proportional, largest)
     Kp, Kd = max(round(integral * Ko), 1), round(proportional * Ko)
     kp, kd = Kp / Ko / scale, Kd / Ko / scale
     # On the measurement the present error's share is proportional action, too.
@@ -77,8 +78,8 @@ def _start(setting: Setting) -> Step:
     return step
 
 
-def _divisor(integral: float, proportional: float, largest: float) -> int:
-    """Return the ``Ko`` at which two whole numbers come nearest to what they stand for."""
+def _find_divisor(integral: float, proportional: float, largest: float) -> int:
+    """Return the ``Ko`` with the smallest rounding error of two integer gains."""
     most = max(min(int(largest / max(integral, proportional)), LARGEST), 1)
 
     def error(Ko: int) -> float:

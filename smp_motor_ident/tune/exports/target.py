@@ -1,4 +1,5 @@
-"""What an export is: numbers for another loop, what they do in it, and what it cannot express."""
+# SPDX-License-Identifier: Apache-2.0
+"""Describe an export: gains for another loop, their effect in it, and its limitations."""
 
 import math
 from collections.abc import Callable, Mapping
@@ -20,7 +21,7 @@ from smp_motor_ident.tune.simulation import Controller, Inputs, StepFigures, sim
 
 @dataclass(frozen=True)
 class Gains:
-    """Numbers in a target's own units, and what they are at the motor shaft."""
+    """Gains in a target's own units, and their equivalents at the motor shaft."""
 
     numbers: Mapping[str, float]  # as the target takes them
     feedback: Feedback  # the same, as rounded, as the feedback of the running loop
@@ -35,7 +36,7 @@ class Gains:
 
 @dataclass(frozen=True)
 class Format:
-    """One loop that others run."""
+    """Another software's loop."""
 
     # name, title, source: keyword, words for people, and where its arithmetic is documented
     name: str
@@ -45,10 +46,10 @@ class Format:
     convert: Callable[[Design], Gains]  # from a design to the target's numbers
     # From the numbers of all wheels to the text that the target takes
     render: Callable[[Mapping[str, Design], Mapping[str, Gains]], str]
-    missing: tuple[str, ...]  # what of a design it cannot express
+    missing: tuple[str, ...]  # parts of a design that it cannot express
     counts: bool = True  # whether it makes its speed from counts, over one of its intervals
     one_set: bool = False  # whether all wheels share their numbers
-    # What the method is asked for
+    # Targets of the method
     targets: Mapping[str, str] = field(
         default_factory=lambda: {"structure": "pi", "focus": "tracking"}
     )
@@ -57,18 +58,18 @@ class Format:
 
 @dataclass(frozen=True)
 class Check:
-    """What exported numbers do in the target's loop."""
+    """Behaviour of exported gains in the target's loop."""
 
     margins: Margins  # of that loop
     # Of an abrupt change of set-point from rest by half of the largest speed; no settling time
     # where it may rest beyond 2 %
     step: StepFigures
-    resting_error: float  # share of that change by which it may rest beside it [-]
+    resting_error: float  # largest error at rest as a share of that change [-]
 
 
 BAND = 0.02  # within which a change of set-point counts as settled
 MILLISECOND = 1e-3
-"""By which an interval in milliseconds may miss a whole number, as rates of six digits do."""
+"""Tolerance for whole milliseconds, since rates have six digits."""
 
 
 def plant_of(design: Design) -> Plant:
@@ -100,11 +101,11 @@ def check(design: Design, gains: Gains) -> Check:
 
 
 def duration(design: Design, gains: Gains) -> float:
-    """Return how long a change of set-point is looked at [s].
+    """Return the simulated length of a change of set-point [s].
 
-    The slow mode of the integral decays with ``(p + a0) / i`` from what feed-forward and
-    proportional action leave, and from what is summed up while the speed rises; it is followed
-    down to a tenth of the band of settling.
+    The slow mode of the integral decays with ``(p + a0) / i`` from the error that feed-forward and
+    proportional action leave, and from the integral of the rise; it is followed down to a tenth of
+    the settling band.
     """
     fb, a0, rise = gains.feedback, 1 / design.motor["dc_gain"], design.motor["time_constant"]
     tail = 0.0
@@ -119,9 +120,9 @@ def duration(design: Design, gains: Gains) -> float:
 
 
 def present_error(feedback: Feedback, sample_time: float) -> Feedback:
-    """Return the gains for an integral that has the present error in it already.
+    """Return the gains for an integral that includes the present error.
 
-    ``p e + I + i T e`` is ``(p + i T) e + I``: of the proportional gain so much is there.
+    ``p e + I + i T e`` is ``(p + i T) e + I``, which contains part of the proportional gain.
     """
     return Feedback(feedback.p - feedback.i * sample_time, feedback.i)
 

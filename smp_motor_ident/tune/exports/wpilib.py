@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """WPILib: SimpleMotorFeedforward kS, kV, kA and kP of a PIDController, volts, every 20 ms.
 
 References

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Tuning methods, one idea a file, all behind one interface."""
 
 from smp_motor_ident.tune.methods.margin import MARGIN

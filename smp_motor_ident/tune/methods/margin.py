@@ -1,4 +1,5 @@
-"""Bandwidth under a margin: the best gains of all that keep phase margin, Ms and control noise.
+# SPDX-License-Identifier: Apache-2.0
+"""Maximise the integral gain under phase margin, Ms and control noise.
 
 Crossover, phase margin and share of the derivative span every PI and PID controller; the
 search looks at thousands at once on the sampled loop's frequency response, then zooms in.
@@ -25,9 +26,9 @@ from smp_motor_ident.tune.problem import Method, Problem, RequiredMargins
 from smp_motor_ident.tune.unmodelled import words
 
 FOCUS = ("balanced", "tracking", "load")
-MORE_NOISE, ENOUGH, NO_SOFTER = 8, 1.2, 1.0
-"""Steps of a fifth by which the default limits of the control noise, and of what noise shakes the
-wheel by, may be raised, until the integral gain is so many times that of SIMC."""
+MAX_NOISE_RAISES, CONTROL_NOISE_TARGET, SPEED_NOISE_TARGET = 8, 1.2, 1.0
+"""Largest number of raises of a default noise limit, each by a fifth, and the integral gain
+relative to SIMC's at which they end: for noise in the control, and for noise in the speed."""
 
 PEAK = {"balanced": 1.25, "tracking": 1.05, "load": math.inf}
 """Largest peak of the complementary sensitivity, by focus."""
@@ -59,17 +60,17 @@ def _solve(problem: Problem) -> Feedback:
     if "bandwidth" in problem.targets and problem.targets["bandwidth"] is not None:
         return _at_bandwidth(problem, problem.target("bandwidth", 1.0), margin, peak)
     found = _search(problem, margin, peak, focus)
-    found = _no_softer_than_simc(problem, found, margin, peak, focus)
+    found = _match_simc(problem, found, margin, peak, focus)
     if found is None:
         raise DesignError(
             f"no controller keeps a phase margin of {margin:g} deg, Ms {peak:g} and a control "
             f"noise of {problem.loop.noise_limit:.3g} V{words(problem.unmodelled, ', where ')}; "
-            f"{_nearest(problem, margin, peak, focus)}"
+            f"{_describe_nearest(problem, margin, peak, focus)}"
         )
     return found[0]
 
 
-def _nearest(problem: Problem, margin: float, peak: float, focus: str) -> str:
+def _describe_nearest(problem: Problem, margin: float, peak: float, focus: str) -> str:
     """Return in words the nearest demand that can be met."""
     for more in (1.05, 1.1, 1.2, 1.3, 1.4, 1.6, 2.0):
         if more > peak and _search(problem, margin, more, focus) is not None:
@@ -82,16 +83,16 @@ def _nearest(problem: Problem, margin: float, peak: float, focus: str) -> str:
                 f"the nearest that holds has a control noise of {limit:.3g} V and "
                 f"Ms {max(peak, 1.4):g}"
             )
-    return "nothing near it does; shorten the delay, or take an encoder with more counts"
+    return "no similar design does; shorten the delay, or use an encoder with more counts"
 
 
-def _no_softer_than_simc(
+def _match_simc(
     problem: Problem, found: _Found | None, margin: float, peak: float, focus: str
 ) -> _Found | None:
-    """Allow more noise, as little as it takes, where its default limits cost more than SIMC.
+    """Raise the default noise limits until the load rejection matches SIMC's.
 
-    SIMC looks at no noise; who compares at the same Ms shall not lose here.  A wheel that noise
-    moves out of the band of its settling costs more than a voltage: that is allowed last.
+    SIMC ignores noise, so at the same Ms the defaults could do worse.  Noise that moves the wheel
+    out of its settling band costs more than noise in the voltage: it is allowed last.
     """
     loop = problem.loop
     if loop.noise_voltage is not None:
@@ -105,17 +106,17 @@ def _no_softer_than_simc(
         return trial[0].i / at_sensitivity(problem, rule, sensitivity).i
 
     best, most = found, better(found)
-    steps = 1.2 ** np.arange(1, MORE_NOISE + 1)
+    steps = 1.2 ** np.arange(1, MAX_NOISE_RAISES + 1)
     for step in steps:
         # The integral of the error is 1/i; that of its magnitude is up to some percent more.
-        if most >= ENOUGH:
+        if most >= CONTROL_NOISE_TARGET:
             return best
         louder = replace(loop, noise_voltage=step * loop.noise_limit)
         trial = _search(replace(problem, loop=louder), margin, peak, focus)
         if better(trial) > 1.02 * most:
             best, most = trial, better(trial)
     for step in steps:
-        if most >= NO_SOFTER:
+        if most >= SPEED_NOISE_TARGET:
             break
         trial = _search(replace(problem, shaking=float(step)), margin, peak, focus)
         if trial is not None and (best is None or trial[0].i > 1.02 * best[0].i):
@@ -190,7 +191,7 @@ def _best(
 
 
 def _candidates(problem: Problem, crossovers: Array, margins: Array, shares: Array) -> _Candidates:
-    """Return the gains that cross over where asked with the phase that is asked."""
+    """Return the gains with the given crossover and phase."""
     T = problem.loop.sample_time
     w, pm, share = (x.ravel() for x in np.meshgrid(crossovers, margins, shares, indexing="ij"))
     plant = np.repeat(problem.plant.response(crossovers)[0], margins.size * shares.size)

@@ -1,4 +1,5 @@
-"""Dominant pole placement: two gains put one pair of closed-loop poles where asked.
+# SPDX-License-Identifier: Apache-2.0
+"""Dominant pole placement: two gains place one pair of closed-loop poles.
 
 With delay, hold and window in the loop there are more poles than gains; the pair is placed
 exactly in the sampled loop, the others are looked at and decide how fast it may be.
@@ -45,7 +46,7 @@ def _solve(problem: Problem) -> Feedback:
         return nearest
     wished = problem.target("natural_frequency", limit)
     feedback = place(problem, wished, damping)
-    if not _good(problem, feedback, wished * damping):
+    if not _is_dominant(problem, feedback, wished * damping):
         raise DesignError(
             f"natural_frequency {wished:.4g} rad/s with damping {damping:g} leaves the loop "
             f"below a phase margin of {REQUIRED.phase:g} deg or above Ms {REQUIRED.sensitivity:g}; "
@@ -54,7 +55,7 @@ def _solve(problem: Problem) -> Feedback:
     return feedback
 
 
-def _good(problem: Problem, feedback: Feedback, decay: float) -> bool:
+def _is_dominant(problem: Problem, feedback: Feedback, decay: float) -> bool:
     """Return whether the placed pair, of decay rate ``decay`` [1/s], dominates and holds."""
     slowest = math.exp(-0.8 * decay * problem.loop.sample_time)
     if feedback.i <= 0 or spectral_radius(problem.plant, feedback)[0] > slowest:
@@ -69,7 +70,7 @@ def _fastest(problem: Problem, damping: float) -> tuple[float, Feedback]:
     corner = 1 / problem.reduced.time_constant
     for frequency in np.geomspace(0.3 * corner, 0.6 * math.pi / problem.loop.sample_time, 60):
         feedback = place(problem, float(frequency), damping)
-        if _good(problem, feedback, float(frequency) * damping):
+        if _is_dominant(problem, feedback, float(frequency) * damping):
             best = float(frequency), feedback
     if best is None:
         raise DesignError(

@@ -1,10 +1,11 @@
+# SPDX-License-Identifier: Apache-2.0
 """Relay feedback: the ultimate point from a bounded oscillation, no model needed.
 
 A relay in place of the controller makes the loop oscillate at a bounded voltage.  The
-fundamental of what it did, ``|U1|^2 / |Y1 U1*|`` over every two cycles (P. Welch, The use of
-fast Fourier transform for the estimation of power spectra, 1967), is the describing function's
-answer for the ultimate gain; the period is that of the oscillation.  The same reading serves an
-oscillation of the simulated loop and one recorded on a running wheel.
+fundamental of the recorded signals, ``|U1|^2 / |Y1 U1*|`` over every two cycles (P. Welch, The
+use of fast Fourier transform for the estimation of power spectra, 1967), gives the ultimate gain
+by the describing function; the ultimate period is that of the oscillation.  The same evaluation
+serves a simulated loop and a recording of a running wheel.
 
 References
 ----------
@@ -23,11 +24,11 @@ from smp_motor_ident.tune.feedback import Feedback
 from smp_motor_ident.tune.methods.ziegler_nichols import from_ultimate
 from smp_motor_ident.tune.problem import Method, Problem, RequiredMargins
 
-LEAST_CYCLES = 4
-ALIKE = 0.25
-"""Share by which the length of a cycle may differ from the usual one and still count."""
+MIN_CYCLES = 4
+CYCLE_TOLERANCE = 0.25
+"""Relative tolerance for the length of a cycle."""
 
-TRANSIENT = 5
+TRANSIENT_CYCLES = 5
 """Cycles after which an oscillation is steady, where as many are there."""
 
 
@@ -71,24 +72,24 @@ def read_oscillation(
     """
     switches = [_settled(voltage) for voltage, _ in stretches]
     lengths = np.concatenate([[], *map(np.diff, switches)])
-    if lengths.size < LEAST_CYCLES:
+    if lengths.size < MIN_CYCLES:
         raise DesignError(
             f"the relay switched over only {lengths.size} steady cycles, it needs "
-            f"{LEAST_CYCLES}; run it longer or with a larger amplitude"
+            f"{MIN_CYCLES}; run it longer or with a larger amplitude"
         )
-    # A cycle during which the machine stood still, or counts made it switch twice, is none.
+    # Skip cycles during which the computer paused, or the relay switched twice on counts.
     usual = float(np.median(lengths))
-    alike = lengths[np.abs(lengths - usual) <= ALIKE * usual]
+    alike = lengths[np.abs(lengths - usual) <= CYCLE_TOLERANCE * usual]
     power, cross = 0.0, 0j
     for begins, signals in zip(switches, stretches, strict=True):
-        steady = np.abs(np.diff(begins) - usual) <= ALIKE * usual
+        steady = np.abs(np.diff(begins) - usual) <= CYCLE_TOLERANCE * usual
         for k in np.flatnonzero(steady[:-1] & steady[1:]):
             sent, answered = (_fundamental(x[begins[k] : begins[k + 2]]) for x in signals)
             power += abs(sent) ** 2
             cross += answered * sent.conjugate()
-    if alike.size < LEAST_CYCLES or power == 0:
+    if alike.size < MIN_CYCLES or power == 0:
         raise DesignError(
-            f"only {alike.size} of {lengths.size} cycles are alike, it needs {LEAST_CYCLES}: the "
+            f"only {alike.size} of {lengths.size} cycles are alike, it needs {MIN_CYCLES}: the "
             "delay wanders; run it on a machine that is less busy"
         )
     if not abs(cross) > 0:
@@ -99,7 +100,7 @@ def read_oscillation(
 def _settled(voltage: Array) -> NDArray[np.int64]:
     """Return the samples at which a relay switches up, without those of the transient."""
     switches = np.flatnonzero((voltage[:-1] <= 0) & (voltage[1:] > 0)) + 1
-    return switches[min(switches.size // 3, TRANSIENT) :]
+    return switches[min(switches.size // 3, TRANSIENT_CYCLES) :]
 
 
 def _fundamental(two_cycles: Array) -> complex:

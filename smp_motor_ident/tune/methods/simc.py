@@ -1,4 +1,5 @@
-"""SIMC: a first-order closed loop as fast as the delay allows, or as slow as is asked.
+# SPDX-License-Identifier: Apache-2.0
+"""SIMC: a first-order closed loop as fast as the delay allows, or slower on request.
 
 References
 ----------

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Ziegler-Nichols and Tyreus-Luyben: rules from the ultimate gain and period.
 
 The ultimate point is that of the model in the sampled loop, with its hold and delay.
@@ -26,7 +27,7 @@ RULES = {
 
 
 def from_ultimate(problem: Problem, rule: str, gain: float, period: float) -> Feedback:
-    """Apply a rule to an ultimate point, whoever found it."""
+    """Apply a rule to an ultimate point from a model or a relay."""
     ruled = by_rule(rule, problem.structure or "pi", gain, period)
     if not ruled.d:
         return ruled

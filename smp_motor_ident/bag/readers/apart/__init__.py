@@ -1,4 +1,5 @@
-"""Formats whose libraries may take any memory or time, or die: a process of its own reads each."""
+# SPDX-License-Identifier: Apache-2.0
+"""Read formats in a separate process, since their libraries may hang, crash or fill the memory."""
 
 import io
 import json
@@ -12,18 +13,18 @@ from smp_motor_ident.errors import BagError
 
 PROGRAM = Path(__file__).parent / "program.py"
 PATIENCE, PER_BYTE = 15.0, 1e-6
-"""How long a file may take to be read [s], and for each of its bytes."""
+"""Longest time to read a file [s], and addition per byte."""
 
 
 def read(kind: str, path: Path, name: str, budget: Budget) -> tuple[dict[str, Any], io.BytesIO]:
-    """Return what the program says of a file, and its data."""
+    """Return the program's description of a file, and its data."""
     command = [sys.executable, str(PROGRAM), kind, str(path), str(budget.left)]
     patience = PATIENCE + PER_BYTE * path.stat().st_size
     try:
         done = subprocess.run(command, capture_output=True, check=False, timeout=patience)
     except subprocess.TimeoutExpired:
         raise BagError(
-            f"{name}: is not read after {patience:.0f} s, which its size does not explain; save "
+            f"{name}: is not read after {patience:.0f} s, too long for its size; save "
             "its columns as CSV"
         ) from None
     if done.returncode:

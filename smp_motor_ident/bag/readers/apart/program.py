@@ -1,4 +1,5 @@
-"""Reads a file by a library of others; arguments: ``MATLAB`` or ``Excel``, path, memory [byte].
+# SPDX-License-Identifier: Apache-2.0
+"""Read a file with an external library; arguments: ``MATLAB`` or ``Excel``, path, memory [byte].
 
 Writes a line of JSON (``error``, ``too_large``, ``objects``, ``columns``, ``sheets``): names of the
 columns, which follow as arrays, or how many rows each sheet has, which follow as lines of JSON.
@@ -23,15 +24,15 @@ _WIDEST = 64  # columns of a matrix that are taken as signals; a wider one is so
 _MOST_VALUES = 100_000  # of structures and cells that are looked at
 _MOST_ROWS = 1_048_576  # of a sheet, by Excel's own limits
 _UNBOUND = resource.getrlimit(resource.RLIMIT_AS)[1]
-_SLACK = 1 << 26  # memory that readers need in addition to what they read [byte]
+_SLACK = 1 << 26  # memory that readers need in addition to the file's contents [byte]
 
 
 class Unreadable(Exception):
-    """Why the file cannot be read, for people."""
+    """The file cannot be read; the text is for the user."""
 
 
 def main() -> None:
-    """Read a file and write what is in it."""
+    """Read a file and write its contents."""
     kind, path, memory = sys.argv[1], Path(sys.argv[2]), int(sys.argv[3])
     head: dict[str, Any] = {"error": "", "too_large": False, "objects": []}
     parts: list[bytes] = []
@@ -48,7 +49,7 @@ def main() -> None:
         head["error"] = str(error)
     except MemoryError:
         head["too_large"], parts = True, []
-    except Exception as error:  # libraries raise whatever their bytes lead them to
+    except Exception as error:  # libraries raise any error on damaged bytes
         reason = (str(error).splitlines() or [type(error).__name__])[0]
         head["error"] = f"no readable {kind} file ({reason[:200]})"
     resource.setrlimit(resource.RLIMIT_AS, (_UNBOUND, _UNBOUND))
@@ -57,7 +58,7 @@ def main() -> None:
 
 
 Part = tuple[tuple[str, Any], bytes]
-"""What the head says of a part, and its bytes."""
+"""Description of a part in the head, and its bytes."""
 
 
 def _variables_of(path: Path, memory: int, head: dict[str, Any]) -> Iterator[Part]:
@@ -84,7 +85,7 @@ def _workbook(path: Path, memory: int) -> Iterator[Part]:
     for sheet in book.worksheets:
         if not hasattr(sheet, "reset_dimensions"):  # a chart
             continue
-        sheet.reset_dimensions()  # what a file says of its width is not what it holds
+        sheet.reset_dimensions()  # the stated width may be wrong
         lines = []
         for k, row in enumerate(sheet.iter_rows()):
             if k >= _MOST_ROWS:
@@ -98,7 +99,7 @@ def _workbook(path: Path, memory: int) -> Iterator[Part]:
 
 
 def _cells(row: Iterable[Any]) -> list[Any]:
-    """Return the values of a row as text shows them, up to the last; empty where there is none."""
+    """Return the values of a row as displayed, up to the last; empty if it has none."""
     cells, filled = [], 0
     for k, cell in enumerate(row, 1):
         value = cell.value
@@ -156,7 +157,7 @@ def _contents(data: bytes, objects: list[str], memory: int) -> Iterator[dict[str
 
 
 def _bound_memory(memory: int) -> None:
-    """Let this process take no more than so much in addition to what it has."""
+    """Limit the memory this process may take in addition to its present use."""
     pages = int(Path("/proc/self/statm").read_text().split()[0])
     limit = pages * resource.getpagesize() + memory + _SLACK
     resource.setrlimit(resource.RLIMIT_AS, (limit, _UNBOUND))
@@ -201,7 +202,7 @@ def _columns(
 
 
 def _parts(prefix: str, value: Any) -> list[tuple[str, Any]] | None:
-    """Return what a structure, or an array of structures or cells, is made of, by their paths."""
+    """Return the parts of a structure, or of an array of structures or cells, by path."""
     if isinstance(value, Mapping):
         return [(f"{prefix}.{k}" if prefix else str(k), inner) for k, inner in value.items()]
     if isinstance(value, list) or (isinstance(value, np.ndarray) and value.dtype == object):

@@ -1,0 +1,55 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Print the messages of tools and nodes as a page: ``python scripts/messages.py``."""
+
+import ast
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[1]
+CALLS = {"Finding", "found", "tell", "_amiss", "warning", "error", "info", "refuse"}
+HEAD = """# Messages
+
+Messages of tools and nodes by package, printed by `python scripts/messages.py`. N is a number and
+… a word; the advice of a finding has its own line.
+"""
+
+
+def read_text(node: ast.expr) -> str:
+    """Return a string with N or … for its placeholders, empty for other expressions."""
+    if isinstance(node, ast.Constant) and isinstance(node.value, str):
+        return node.value
+    if isinstance(node, ast.FormattedValue):
+        form = ast.unparse(node.format_spec) if node.format_spec else ""
+        return "N %" if form.endswith("%'") else "N" if form.endswith(("g'", "f'")) else "…"
+    return "".join(map(read_text, node.values)) if isinstance(node, ast.JoinedStr) else ""
+
+
+def read_messages(path: Path) -> Iterator[str]:
+    """Yield the messages in a module: texts of errors, findings, diagnostics and logs."""
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        texts: list[ast.expr] = []
+        if isinstance(node, ast.Call):
+            name = ast.unparse(node.func).rpartition(".")[2]
+            texts = node.args if name in CALLS or name.endswith("Error") else []
+        elif isinstance(node, ast.Assign) and ast.unparse(node.targets[0]) in ("text", "message"):
+            texts = [node.value]
+        for text in map(read_text, texts):
+            if len(re.findall(r"[a-z]{2,}", text)) > 2 and " " in text:
+                yield " ".join(text.split())
+
+
+def page() -> str:
+    """Return all messages as a page of Markdown."""
+    found: dict[str, set[str]] = {}
+    for path in sorted(ROOT.glob("smp_motor_*/**/*.py")):
+        package = "/".join(path.relative_to(ROOT).parts[:2]).removesuffix(".py")
+        found.setdefault(package, set()).update(read_messages(path))
+    lines = [HEAD]
+    for package, texts in filter(lambda item: item[1], found.items()):
+        lines += [f"## {package}", "", "```text", *(f"- {one}" for one in sorted(texts)), "```", ""]
+    return "\n".join(lines)
+
+
+if __name__ == "__main__":
+    print(page(), end="")

@@ -1,0 +1,102 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Track the temperature of a winding by its resistance, between recordings.
+
+The equation is integrated over blocks of time, to avoid differentiation:
+
+    int v dt = R int i dt + K dtheta + L di + c T,
+
+so a regression over the blocks of a recording gives R, whatever the friction.  The course of the
+current between its samples, while the held voltage steps, adds a share of the change of both over
+the block.  That change carries the noise of the current, so instrumental variables free of it
+weigh the sums: voltage, angle and the change of speed.  Copper's resistance grows by 0.39 %/K;
+the parts of driver and brushes do not.
+
+References
+----------
+L. Ljung, *System Identification*, 2nd ed. (1999), section 7.6 for the instruments.
+"""
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from smp_motor_ident.commission.wheel_limits import WINDING_RISE
+from smp_motor_ident.finding import Finding
+from smp_motor_ident.live.monitor import BLOCK, COPPER
+from smp_motor_ident.record import Record
+
+SURE = 3.0
+"""Required excess over the limit [standard deviations]."""
+
+
+SEPARABLE = 1e6
+"""Condition number beyond which the columns of a recording are collinear."""
+
+
+class Resistance(NamedTuple):
+    """Of a winding and its driver [ohm]."""
+
+    value: float
+    std: float
+
+
+def resistance(record: Record) -> Resistance | None:
+    """Return the winding's resistance; None without a current or with too little motion."""
+    motion = record.count if record.position is None else record.position
+    if record.current is None or motion is None:
+        return None
+    dt = np.diff(record.time)
+    current, voltage = record.current, record.voltage
+    turned = np.diff(np.asarray(motion, dtype=np.float64))
+    block = (record.time[1:] / BLOCK).astype(np.int64) * len(record.starts)
+    block += np.searchsorted(record.starts, np.arange(1, len(record)), side="right")
+    speeding = np.diff(turned / dt, prepend=0.0)
+    changes = np.diff(current), np.diff(voltage)
+    rows = np.stack([voltage[1:] * dt, current[1:] * dt, turned, *changes, dt, speeding])
+    good = np.isfinite(rows).all(axis=0)
+    good[np.asarray(record.starts[1:], dtype=np.int64) - 1] = False
+    sums = np.stack([np.bincount(block[good], weights=row[good]) for row in rows])
+    moves = (sums[5] > 0.5 * BLOCK) & (sums[2] != 0.0)
+    volts, amps, angle, surge, step, spent, run_up = sums[:, moves]
+    table = np.stack([amps, angle, surge, step, spent])
+    known = np.stack([volts, angle, run_up, step, spent])  # free of the current's noise
+    spare = volts.size - len(table)
+    sizes, tools = np.linalg.norm(table, axis=1), np.linalg.norm(known, axis=1)
+    if spare < len(table) or not (sizes > 0).all() or not (tools > 0).all():
+        return None
+    normal = (known / tools[:, None]) @ (table / sizes[:, None]).T
+    if np.linalg.cond(normal) > SEPARABLE:
+        return None
+    inverse = np.linalg.inv(normal) / sizes[:, None]
+    solved = inverse @ (known / tools[:, None] @ volts)
+    noise = float(np.square(volts - solved @ table).sum()) / spare
+    alike = known @ known.T / np.outer(tools, tools)
+    return Resistance(
+        float(solved[0]), math.sqrt(noise * float((inverse @ alike @ inverse.T)[0, 0]))
+    )
+
+
+def heated(wheel: str, earlier: Sequence[Record], last: Record) -> list[Finding]:
+    """Return whether a winding is too much hotter than in the earlier recording with the most
+    accurate resistance.
+    """
+    known = [r for one in earlier if (r := resistance(one)) is not None and r.value > 0]
+    now = resistance(last)
+    if not known or now is None:
+        return []
+    cold = min(known, key=lambda r: r.std / r.value)
+    rise = now.value / cold.value - 1.0
+    std = math.hypot((1.0 + rise) * cold.std, now.std) / cold.value
+    if rise - SURE * std <= WINDING_RISE.value:
+        return []
+    warmer = rise / COPPER
+    return [Finding(
+        "winding_hot", "refused",
+        f"{wheel}: its resistance rose by {100 * rise:.0f} % from signal to signal: the winding "
+        f"is {warmer:.0f} K hotter",
+        {"wheel": wheel, "rise": rise, "warmer": warmer},
+        "let it cool and continue with --resume; check that the wheel turns freely, or start again "
+        "with a smaller --amplitude",
+    )]  # fmt: skip

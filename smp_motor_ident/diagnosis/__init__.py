@@ -1,1 +1,0 @@
-"""What data and results are worth: checks before, tests after, advice."""

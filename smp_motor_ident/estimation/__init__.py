@@ -1,1 +1,0 @@
-"""From prepared records to the fitted model: start, descent, order selection, uncertainty."""

@@ -1,0 +1,109 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Whether a chain explains a recording: scatter of the score between parts of it.
+
+Where the chain is right, the gradient of the likelihood over any part of the record is noise of a
+known covariance.  More scatter says that parts of the record, or regimes of the motion, ask for
+other parameters.
+
+References
+----------
+H. White, Econometrica 50 (1982), 1-25 (information matrix test); W. K. Newey, K. D. West,
+Econometrica 55 (1987), 703-708.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from smp_motor_control.arrays import Array, Integers
+from smp_motor_ident.fit.data import Data
+from smp_motor_ident.fit.descend import Fit
+from smp_motor_ident.fit.start import command_of
+
+BLOCKS = 24
+SIGNIFICANT = 2.0  # standard deviations of a scatter that chance does not explain
+
+
+@dataclass(frozen=True, eq=False)
+class Scatter:
+    """Disagreement between the parts of one partition of a record."""
+
+    name: str
+    ratio: float  # of the scatter over that by chance
+    significant: bool
+    excess: Array  # shape (p, p): covariance of the parameters beyond chance
+
+
+def scatters(data: Data, found: Fit) -> list[Scatter]:
+    """Return the scatter of the score over every partition."""
+    made = (scatter(found, name, label) for name, label in partitions(data, found))
+    return [one for one in made if one is not None]
+
+
+def partitions(data: Data, found: Fit) -> Iterator[tuple[str, Integers]]:
+    """Yield labels of rows whose scores are independent where the chain is right.
+
+    They are taken from the simulated motion: that measured shares its noise with the residual.
+    """
+    n = len(data)
+    yield "autocorrelation", np.arange(n) * BLOCKS // n
+    motion = found.motion
+    if data.is_angle:
+        motion = np.diff(motion, prepend=np.nan) / np.where(
+            data.rows.interval > 0, data.rows.interval, np.nan
+        )
+    speed = np.nan_to_num(motion)
+    size = np.abs(speed)
+    level = np.searchsorted(np.quantile(size, [0.15, 0.3, 0.5, 0.7, 0.85]), size)
+    yield "speed", (2 * level + (speed > 0)).astype(np.int64)
+    quick = np.abs(np.diff(speed, prepend=speed[0]))
+    level = np.searchsorted(np.quantile(quick, [0.2, 0.4, 0.6, 0.8]), quick)
+    command = np.abs(command_of(data.rows))
+    high = command > np.median(command)
+    yield "acceleration", (2 * level + high).astype(np.int64)
+
+
+def scatter(found: Fit, name: str, label: Integers) -> Scatter | None:
+    """Return the scatter between the parts that labels tell apart."""
+    linear = found.linear
+    m, p = linear.row.size, linear.columns.shape[1]
+    count = int(label.max()) + 1
+    which = label[linear.row]
+    scores = linear.columns[:m] * linear.residual[:m, None]
+    sums = np.stack([np.bincount(which, s, count) for s in scores.T], axis=1)
+    expected = np.zeros((count, p, p))
+    columns = linear.columns[:m]
+    for k in range(count):
+        part = columns[which == k]
+        expected[k] = part.T @ part
+    inverse = found.covariance
+    spread = np.zeros((p, p))
+    statistic = dof = 0.0
+    for k in range(count):
+        share = expected[k]
+        # The scores sum to zero: each is known less the part that the fit took up.
+        own = share - share @ inverse @ share
+        scale = np.sqrt(np.maximum(np.diag(share), 1e-300))
+        if not np.isfinite(own).all() or not np.isfinite(sums[k]).all():
+            return None
+        values, vectors = np.linalg.eigh(own / np.outer(scale, scale))
+        keep = values > 1e-6
+        z = (vectors[:, keep].T @ (sums[k] / scale)) / np.sqrt(values[keep])
+        statistic += float(z @ z)
+        dof += int(keep.sum())
+        excess = np.outer(sums[k], sums[k]) - own
+        spread += excess
+    if dof == 0:
+        return None
+    values, vectors = np.linalg.eigh(_symmetric(inverse @ spread @ inverse))
+    excess = (vectors * np.maximum(values, 0.0)) @ vectors.T
+    significant = (statistic - dof) / math.sqrt(2 * dof) > SIGNIFICANT
+    return Scatter(name, statistic / dof, significant, excess)
+
+
+def _symmetric(a: Array) -> Array:
+    return np.asarray(0.5 * (a + a.T))

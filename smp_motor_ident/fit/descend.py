@@ -1,0 +1,390 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Weighted least squares of a chain on data, from given values.
+
+Levenberg-Marquardt on residuals whitened by the noise of every output; derivatives are differences
+between lanes of one simulation.  The initial state of every segment is eliminated.
+Derivation: docs/derivations.md, sections 5 and 6.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from smp_motor_control.arrays import Array, Integers
+from smp_motor_ident.chain.chain import Chain, Constraint, respond
+from smp_motor_ident.chain.component import Scales
+from smp_motor_ident.chain.quantities import jacobian
+from smp_motor_ident.fit.data import Data
+from smp_motor_ident.fit.noise import MAX_ORDER, Noise, fit_noise
+
+FARTHEST = 1.5  # e-folds that a logarithm moves in one step
+MAX_STEPS = 30
+CONVERGED = 1e-3  # of the deviance: a tenth of a standard deviation squared is 1e-2
+PRIOR_STATE = 2.0  # of q and speed at the beginning of a segment, in the largest of the recording
+
+
+@dataclass(frozen=True, eq=False)
+class Linear:
+    """Residuals and derivatives of a chain at its values, whitened; segments' states eliminated.
+
+    The last ``priors`` rows are of the motor's prior.
+    """
+
+    residual: Array  # shape (m + priors,)
+    columns: Array  # shape (m + priors, p)
+    row: Integers  # shape (m,): row of the record
+    output: Integers  # shape (m,): place of the output
+    priors: int
+    local_step: Array  # shape (segments, 3): of the initial states at a step of zero
+    local_gain: Array  # shape (segments, 3, p): its decrease per parameter step
+    simulated: tuple[Array, ...]  # every output, shape (n,)
+
+    @cached_property
+    def cost(self) -> float:
+        """Sum of squares."""
+        return float(self.residual @ self.residual)
+
+    @cached_property
+    def normal(self) -> Array:
+        """Normal matrix, shape (p, p)."""
+        return np.asarray(self.columns.T @ self.columns)
+
+
+@dataclass(frozen=True, eq=False)
+class Fit:
+    """A chain that was fitted to data."""
+
+    chain: Chain
+    scales: Scales
+    initial: Array  # shape (segments, 4)
+    noise: tuple[Noise, ...]  # of every output
+    linear: Linear
+    deviance: float  # -2 log likelihood, up to a constant of the data
+
+    @cached_property
+    def priors(self) -> tuple[str, ...]:
+        """Causes of the last rows of ``linear``."""
+        return _prior(self.chain, self.scales)[2]
+
+    @property
+    def motion(self) -> Array:
+        """The simulated motion, shape (n,)."""
+        return self.linear.simulated[0]
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the parameters that were estimated."""
+        return tuple(p.name for p in self.chain.free)
+
+    @cached_property
+    def covariance(self) -> Array:
+        """Covariance of the estimated parameters under their noise model, shape (p, p)."""
+        return invert(self.linear.normal)
+
+
+def invert(normal: Array) -> Array:
+    """Return the inverse of a normal matrix; without information the variance is very large."""
+    scale = np.sqrt(np.maximum(np.diag(normal), 1e-300))
+    values, vectors = np.linalg.eigh(normal / np.outer(scale, scale))
+    inverse = (vectors / np.maximum(values, 1e-13)) @ vectors.T
+    return np.asarray(inverse / np.outer(scale, scale))
+
+
+def linearise(
+    data: Data, chain: Chain, scales: Scales, initial: Array, noise: Sequence[Noise]
+) -> Linear:
+    """Return whitened residuals and derivatives of a chain."""
+    free = chain.free
+    p = len(free)
+    count = p + 3  # the base, a lane for each parameter, then for q and w of the segments
+    values = {q.name: np.full(count, chain.values[q.name]) for q in chain.parameters}
+    difference = np.empty(count - 1)
+    for j, parameter in enumerate(free):
+        d = parameter.difference(scales)
+        if chain.values[parameter.name] + d > parameter.bounds(scales)[1]:
+            d = -d
+        if parameter.name == "delay":
+            d = abs(d)
+        difference[j] = d
+        values[parameter.name][j + 1] += d
+    own = np.zeros((4, count))
+    own[0, p + 1] = difference[p] = 1e-6 * scales.volts
+    own[1, p + 2] = difference[p + 1] = 1e-6 * scales.speed
+    got = respond(chain, values, data.rows, scales, initial, own)
+    outputs = (got.motion,) if got.current is None else (got.motion, got.current)
+    n = len(data)
+    parts: list[Array] = []
+    simulated: list[Array] = []
+    for k, (measured, predicted) in enumerate(zip(data.outputs, outputs, strict=True)):
+        known = data.known[k]
+        simulated.append(predicted[:, 0].copy())
+        columns = np.empty((known.size, p + 4))
+        shown = predicted if known.size == n else predicted[known]
+        columns[:, 0] = measured[known] - shown[:, 0]
+        np.subtract(shown[:, 1:], shown[:, :1], out=columns[:, 1 : p + 3])
+        columns[:, 1 : p + 3] /= difference
+        columns[:, p + 3] = 1.0 if data.is_angle and k == 0 else 0.0
+        runs = data.whole_runs if noise[k].over_gaps else data.runs
+        parts.append(noise[k].whiten(columns, runs[k]))
+    return _eliminate(data, parts, p, scales, initial, tuple(simulated), _prior(chain, scales)[:2])
+
+
+def _prior(chain: Chain, scales: Scales) -> tuple[Array, Array, tuple[str, ...]]:
+    """Return residuals, rows and names of the components' priors."""
+    names = [p.name for p in chain.free]
+    residuals, rows, causes = [], [], []
+    for component in chain.components:
+        for weights, mean, deviation in component.expected(scales):
+            if any(n in names for n in weights):
+                at = sum(w * chain.values[n] for n, w in weights.items())
+                residuals.append((mean - at) / deviation)
+                rows.append([weights.get(n, 0.0) / deviation for n in names])
+                causes.append(next(iter(weights)))
+    for constraint in chain.constraints:
+        row, off, size = _constrained(chain, constraint)
+        if size > 0:
+            residuals.append(off / size)
+            rows.append(list(row / size))
+            causes.append(constraint.quantity)
+    # A parameter without effect gets a standard deviation of ten times its size, and stays.
+    for j, p in enumerate(chain.free):
+        residuals.append(0.0)
+        causes.append(p.name)
+        rows.append([0.0] * len(names))
+        rows[-1][j] = 0.1 / (max(p.typical, 1.0) * scales.of(p.unit))
+    made = np.array(rows).reshape(len(rows), len(names))
+    return np.array(residuals), made, tuple(causes)
+
+
+def _constrained(chain: Chain, constraint: Constraint) -> tuple[Array, float, float]:
+    """Return gradient, distance and deviation of a constraint; 0 for one that does not bind."""
+    values, rows = jacobian(chain)
+    if constraint.quantity not in values:
+        return np.zeros(0), 0.0, 0.0
+    at = values[constraint.quantity]
+    to = min(max(at, constraint.low), constraint.high)
+    if to == at and constraint.low < constraint.high:
+        return np.zeros(0), 0.0, 0.0
+    row = rows[list(values).index(constraint.quantity)]
+    return row, to - at, constraint.deviation * max(abs(to), 1e-12)
+
+
+def _eliminate(
+    data: Data, parts: Sequence[Array], p: int, scales: Scales, initial: Array,
+    simulated: tuple[Array, ...], prior_rows: tuple[Array, Array],
+) -> Linear:  # fmt: skip
+    """Project the initial states of all segments out of residual and columns."""
+    segment = data.rows.segment
+    g = segment.size - 1
+    step, gain = np.zeros((g, 3)), np.zeros((g, 3, p))
+    prior = [(PRIOR_STATE * size) ** -2 for size in (scales.volts, scales.speed)]
+    kept = []
+    bounds = [np.searchsorted(known, segment) for known in data.known]
+    rows, output = [], []
+    for k in range(g):
+        slices = [slice(b[k], b[k + 1]) for b in bounds]
+        block = np.concatenate([part[own] for part, own in zip(parts, slices, strict=True)])
+        rows += [known[own] for known, own in zip(data.known, slices, strict=True)]
+        output += [np.full(own.stop - own.start, n) for n, own in enumerate(slices)]
+        if np.isfinite(data.huber):
+            size = np.maximum(np.abs(block[:, 0]), 1e-300)
+            block = block * np.sqrt(np.minimum(1.0, data.huber / size))[:, None]
+        local = [2] if data.stood[k] else [0, 1, 2]
+        columns = block[:, [p + 1 + j for j in local]]
+        rest = block[:, : p + 1]
+        small = columns.T @ columns
+        right = columns.T @ rest
+        for j in range(len(local) - 1):
+            small[j, j] += prior[j]
+            right[j, 0] -= prior[j] * initial[k, j]
+        scale = np.sqrt(np.maximum(np.diag(small), 1e-300))
+        small = small / np.outer(scale, scale) + 1e-12 * np.eye(len(local))
+        solved = np.linalg.solve(small, right / scale[:, None]) / scale[:, None]
+        kept.append(rest - columns @ solved)
+        step[k, local] = solved[:, 0]
+        gain[k, local] = solved[:, 1:]
+    kept.append(np.column_stack(prior_rows))
+    whole = np.concatenate(kept)
+    return Linear(
+        whole[:, 0], whole[:, 1:], np.concatenate(rows), np.concatenate(output),
+        prior_rows[0].size, step, gain, simulated,
+    )  # fmt: skip
+
+
+def descend(
+    data: Data, chain: Chain, scales: Scales, initial: Array, noise: Sequence[Noise],
+    most: int = MAX_STEPS, converged: float = CONVERGED,
+) -> Fit:  # fmt: skip
+    """Return the chain at the nearest minimum of the whitened sum of squares."""
+    at, start = chain, initial.copy()
+    linear = linearise(data, at, scales, start, noise)
+    damping = 1e-4
+    for _ in range(most):
+        if not at.free:
+            start = _settled(start, linear, np.zeros(0))
+            linear = linearise(data, at, scales, start, noise)
+            break
+        step = _step(linear, at, scales, damping)
+        if not np.isfinite(step).all():
+            break
+        values = _moved(at, scales, step)
+        taken = np.array([values[p.name] - at.values[p.name] for p in at.free])
+        expected = float(taken @ (2 * linear.columns.T @ linear.residual - linear.normal @ taken))
+        local = np.abs(linear.local_step).max() > 0
+        trial = at.with_values(values)
+        trial_start = _settled(start, linear, taken)
+        following = linearise(data, trial, scales, trial_start, noise)
+        gained = linear.cost - following.cost
+        if np.isfinite(following.cost) and gained >= -1e-9 * linear.cost:
+            at, start, linear = trial, trial_start, following
+            damping = max(damping / 10, 1e-12)
+            if expected < converged and gained < converged:
+                break
+        else:
+            damping = max(damping * 10, 1e-3)
+            if damping > 1e6 or (expected < converged and not local):
+                break
+    return Fit(at, scales, start, tuple(noise), linear, _deviance(data, linear, noise))
+
+
+def _deviance(data: Data, linear: Linear, noise: Sequence[Noise]) -> float:
+    return linear.cost + sum(
+        its.log_determinant(runs) for its, runs in zip(noise, data.runs, strict=True)
+    )
+
+
+def _step(linear: Linear, chain: Chain, scales: Scales, damping: float) -> Array:
+    """Return the damped Gauss-Newton step; parameters pushed against a bound stay."""
+    gradient = linear.columns.T @ linear.residual
+    normal = linear.normal
+    scale = np.sqrt(np.maximum(np.diag(normal), 1e-300))
+    inside = np.ones(scale.size, dtype=np.bool_)
+    step = np.zeros(scale.size)
+    for _ in range(scale.size):
+        k = np.flatnonzero(inside)
+        if not k.size:
+            break
+        a = normal[np.ix_(k, k)] / np.outer(scale[k], scale[k])
+        a[np.diag_indices(k.size)] += damping + 1e-13
+        step[:] = 0.0
+        step[k] = np.linalg.solve(a, gradient[k] / scale[k]) / scale[k]
+        pushed = False
+        for j, p in enumerate(chain.free):
+            low, high = p.bounds(scales)
+            value = chain.values[p.name]
+            if inside[j] and ((value <= low and step[j] < 0) or (value >= high and step[j] > 0)):
+                inside[j] = False
+                pushed = True
+        if not pushed:
+            break
+    logs = [abs(s) for s, p in zip(step, chain.free, strict=True) if p.unit == "ln"]
+    longest = max(logs, default=0.0)
+    return step * (FARTHEST / longest) if longest > FARTHEST else step
+
+
+def _moved(chain: Chain, scales: Scales, step: Array) -> dict[str, float]:
+    """Return values after a step, within their bounds."""
+    out = {}
+    for s, p in zip(step, chain.free, strict=True):
+        low, high = p.bounds(scales)
+        out[p.name] = float(min(max(chain.values[p.name] + s, low), high))
+    return out
+
+
+def _settled(initial: Array, linear: Linear, step: Array) -> Array:
+    out = initial.copy()
+    out[:, :3] += linear.local_step - linear.local_gain @ step
+    return out
+
+
+def fit(
+    data: Data, chain: Chain, scales: Scales, initial: Array, noise: Sequence[Noise] | None = None,
+    rounds: int = 6, most: int = MAX_ORDER,
+) -> Fit:  # fmt: skip
+    """Return the chain and the noise of every output that explain data best from given values."""
+    if noise is None:
+        # A misfit tells no noise: a drifting angle is fitted by its speed.
+        noise = [Noise.white(float(np.nanstd(y)) or 1.0) for y in data.outputs]
+        if data.is_angle:
+            noise[0] = Noise.integrated(float(np.nanstd(data.speed)) * data.rows.step or 1.0)
+        found = descend(data, chain, scales, initial, noise, most=20, converged=1e-6)
+        chain, initial = found.chain, found.initial
+        noise = noises(data, found.linear, most)
+    found = descend(data, chain, scales, initial, noise, most=8, converged=1.0)
+    for _ in range(rounds):
+        before = found.deviance
+        noise = noises(data, found.linear, most)
+        found = descend(data, found.chain, scales, found.initial, noise)
+        if abs(before - found.deviance) < 0.1:
+            break
+    return found
+
+
+def refine(data: Data, found: Fit) -> Fit:
+    """Return a fit, or that which begins at it under white noise, where it is better.
+
+    Coloured noise takes up a misfit of the motion, and keeps it.
+    """
+    if found.noise[0].order == 0:
+        return found
+    white = (Noise.white(float(np.nanstd(data.motion - found.motion))), *found.noise[1:])
+    begun = descend(data, found.chain, found.scales, found.initial, white)
+    other = fit(data, begun.chain, begun.scales, begun.initial, noises(data, begun.linear))
+    return min(found, other, key=lambda f: _information_criterion(data, f))
+
+
+def _information_criterion(data: Data, found: Fit) -> float:
+    counts = zip(found.noise, data.known, strict=True)
+    return found.deviance + sum(n.order * math.log(max(k.size, 2)) for n, k in counts)
+
+
+def constrain(data: Data, found: Fit, constraints: Sequence[Constraint]) -> Fit:
+    """Return the fit under constraints, which are tightened step by step.
+
+    A tight one has a narrow valley, along which a descent from afar gets nowhere.
+    """
+    for deviation in (0.3, 0.03, 3e-3, 3e-4, 1e-6):
+        held = tuple(replace(c, deviation=deviation) for c in constraints)
+        chain = replace(found.chain, constraints=held)
+        found = descend(data, chain, found.scales, found.initial, found.noise)
+    return fit(data, found.chain, found.scales, found.initial, found.noise)
+
+
+def refit(data: Data, found: Fit) -> Fit:
+    """Return the fit to other rows of the recording of a fit, under the noise that they show."""
+    begun = restate(data, found)
+    return fit(data, found.chain, found.scales, begun.initial, begun.noise)
+
+
+def restate(data: Data, found: Fit) -> Fit:
+    """Return a fit at the same values on other rows of its recording."""
+    still = replace(found.chain, fixed=frozenset(p.name for p in found.chain.parameters))
+    noise = [Noise.white(float(np.nanstd(y)) or 1.0) for y in data.outputs]
+    begun = descend(data, still, found.scales, data.initial, noise)
+    shown = tuple(noises(data, begun.linear))
+    linear = linearise(data, found.chain, found.scales, begun.initial, shown)
+    return replace(found, initial=begun.initial, noise=shown, linear=linear)
+
+
+def settle(data: Data, chain: Chain, scales: Scales) -> Array:
+    """Return the motion simulated freely, only the initial states fitted."""
+    chain = chain.without_slot("current sensor")
+    fixed = replace(chain, fixed=frozenset(p.name for p in chain.parameters), constraints=())
+    motion = replace(data, current=None)
+    noise = [Noise.white(1e-3 * float(np.nanstd(data.motion)) or 1.0)]
+    initial = data.initial
+    for _ in range(4):
+        linear = linearise(motion, fixed, scales, initial, noise)
+        initial = _settled(initial, linear, np.zeros(0))
+    return linearise(motion, fixed, scales, initial, noise).simulated[0]
+
+
+def noises(data: Data, linear: Linear, most: int = MAX_ORDER) -> list[Noise]:
+    """Return the noise of every output by its residual."""
+    every = zip(data.outputs, linear.simulated, data.known, data.runs, strict=True)
+    return [fit_noise((y - x)[known], runs, most) for y, x, known, runs in every]

@@ -1,0 +1,148 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Noise of an output: an autoregression of its residual, and whitening by it.
+
+The order is chosen by the Bayesian information criterion, coefficients by Burg's recursion.  The
+first rows of every run are predicted by the lower orders, so that the likelihood is exact.
+
+References
+----------
+P. Stoica, R. Moses, Spectral Analysis of Signals (2005), section 3.9.3 (Burg); P. J. Brockwell,
+R. A. Davis, Time Series: Theory and Methods, 2nd ed. (1991), section 8.7 (exact likelihood).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from smp_motor_control.arrays import Array, Integers
+from smp_motor_ident._compile import compiled
+
+MAX_ORDER = 24
+LEAST = 1e-300  # variance
+
+
+@dataclass(frozen=True, eq=False)
+class Noise:
+    """Autoregressive noise of one output.
+
+    ``predictors[m]`` predicts a residual from the ``m`` before it, the latest first;
+    ``deviation[m]`` is the standard deviation of its error.
+    """
+
+    predictors: Array  # shape (order + 1, order)
+    deviation: Array  # shape (order + 1,)
+    over_gaps: bool = False  # whether the measured row before is used however long ago it was
+
+    @property
+    def order(self) -> int:
+        """Number of residuals that predict the next."""
+        return int(self.predictors.shape[1])
+
+    @classmethod
+    def white(cls, deviation: float) -> Noise:
+        """Return noise without memory."""
+        return cls(np.zeros((1, 0)), np.array([max(deviation, math.sqrt(LEAST))]))
+
+    @classmethod
+    def integrated(cls, deviation: float) -> Noise:
+        """Return noise whose difference from row to row is white."""
+        last = max(deviation, math.sqrt(LEAST))
+        return cls(np.array([[0.0], [1.0]]), np.array([1e3 * last, last]), True)
+
+    def whiten(self, columns: Array, runs: Integers) -> Array:
+        """Return columns of shape (n, c) whitened."""
+        return _whiten(columns, runs, self.predictors, self.deviation)
+
+    def log_determinant(self, runs: Integers) -> float:
+        """Return the logarithm of the determinant of the noise's covariance over all runs."""
+        length = runs[:, 1] - runs[:, 0]
+        total = 0.0
+        for m in range(self.order):
+            total += 2 * math.log(self.deviation[m]) * int((length > m).sum())
+        most = int(np.maximum(length - self.order, 0).sum())
+        return total + 2 * math.log(self.deviation[-1]) * most
+
+
+def runs_of(rows: Integers, segment: Integers, gap: int) -> Integers:
+    """Return first and end of runs of rows within a segment that are at most ``gap`` apart."""
+    which = np.searchsorted(segment, rows, side="right")
+    ends = np.flatnonzero((np.diff(which) > 0) | (np.diff(rows) > gap)) + 1
+    bounds = np.concatenate([[0], ends, [rows.size]])
+    return np.stack([bounds[:-1], bounds[1:]], axis=1).astype(np.int64)
+
+
+def fit_noise(residual: Array, runs: Integers, most: int = MAX_ORDER) -> Noise:
+    """Return the noise that a residual shows, shape (n,)."""
+    count = int((runs[:, 1] - runs[:, 0]).sum())
+    most = max(0, min(most, count // 20))
+    reflection, variance = _burg(residual, runs, most)
+    # Below its rounding a residual tells nothing.
+    floor = max(LEAST, 1e-26 * float(variance[0]))
+    variance = np.maximum(variance, floor)
+    orders = np.arange(most + 1)
+    best = int(np.argmin(count * np.log(variance) + math.log(max(count, 2)) * orders))
+    predictors = np.zeros((best + 1, best))
+    for m in range(1, best + 1):
+        k = reflection[m - 1]
+        previous = predictors[m - 1, : m - 1]
+        predictors[m, : m - 1] = previous - k * previous[::-1]
+        predictors[m, m - 1] = k
+    # Variances of the lower orders follow from that of the highest.
+    deviation = np.empty(best + 1)
+    deviation[best] = math.sqrt(variance[best])
+    for m in range(best, 0, -1):
+        rest = max(1 - reflection[m - 1] ** 2, 1e-9)
+        deviation[m - 1] = deviation[m] / math.sqrt(rest)
+    return Noise(predictors, deviation)
+
+
+@compiled
+def _burg(residual: Array, runs: Integers, most: int) -> tuple[Array, Array]:
+    """Return reflection coefficients and the variance of the prediction's error of every order."""
+    forward, backward = residual.copy(), residual.copy()
+    reflection, variance = np.zeros(most), np.zeros(most + 1)
+    total, count = 0.0, 0
+    for r in range(runs.shape[0]):
+        for k in range(runs[r, 0], runs[r, 1]):
+            total += residual[k] * residual[k]
+            count += 1
+    variance[0] = total / max(count, 1)
+    for m in range(1, most + 1):
+        top = bottom = 0.0
+        for r in range(runs.shape[0]):
+            for k in range(runs[r, 0] + m, runs[r, 1]):
+                top += forward[k] * backward[k - 1]
+                bottom += forward[k] * forward[k] + backward[k - 1] * backward[k - 1]
+        c = 2.0 * top / bottom if bottom > 0.0 else 0.0
+        reflection[m - 1] = c
+        variance[m] = variance[m - 1] * max(1.0 - c * c, 1e-15)
+        for r in range(runs.shape[0]):
+            for k in range(runs[r, 1] - 1, runs[r, 0] + m - 1, -1):
+                f, b = forward[k], backward[k - 1]
+                forward[k] = f - c * b
+                backward[k] = b - c * f
+    return reflection, variance
+
+
+@compiled
+def _whiten(columns: Array, runs: Integers, predictors: Array, deviation: Array) -> Array:
+    n, c = columns.shape
+    most = predictors.shape[1]
+    out = np.zeros((n, c))
+    for r in range(runs.shape[0]):
+        first = runs[r, 0]
+        for k in range(first, runs[r, 1]):
+            m = min(k - first, most)
+            for j in range(c):
+                out[k, j] = columns[k, j]
+            for i in range(m):
+                a = predictors[m, i]
+                for j in range(c):
+                    out[k, j] -= a * columns[k - 1 - i, j]
+            scale = 1.0 / deviation[m]
+            for j in range(c):
+                out[k, j] *= scale
+    return out

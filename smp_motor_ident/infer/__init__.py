@@ -1,0 +1,2 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Quantities of a fitted chain, their uncertainty, and findings about both."""

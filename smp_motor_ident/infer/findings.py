@@ -1,0 +1,452 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Collect findings on an estimate, with advice on further recordings or measurements."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from smp_motor_control.motor.parameters import PHYSICAL
+from smp_motor_ident.chain.component import Component, Parameter
+from smp_motor_ident.chain.quantities import REPORTED
+from smp_motor_ident.errors import CurrentError, InsufficientExcitationError, SignalError
+from smp_motor_ident.finding import Finding
+from smp_motor_ident.fit.adequacy import Scatter
+from smp_motor_ident.fit.data import Data, prepare
+from smp_motor_ident.fit.descend import Fit, fit
+from smp_motor_ident.fit.start import guesses
+from smp_motor_ident.infer.answer import BY_CURRENT, Answer
+from smp_motor_ident.infer.levels import Levels
+from smp_motor_ident.infer.uncertainty import Contribution
+from smp_motor_ident.infer.validation import explained, white_share
+from smp_motor_ident.quality import limits
+from smp_motor_ident.quality.sample_limits import FRICTION_MOST
+from smp_motor_ident.quality.screen import where_of
+from smp_motor_ident.quality.units import implausible_motor
+from smp_motor_ident.record import Record
+from smp_motor_ident.result import UNITS, FitPercent, Quantity, ResidualTests
+
+PLAIN = (
+    "first_order",
+    "second_order",
+    "electromechanical",
+    "friction",
+    "speed",
+    "differenced_speed",
+    "angle",
+    "current",
+)
+"""Components without a finding."""
+STANDING = 0.9
+"""Share of white noise in a motion above which the motor is at rest."""
+SIGNIFICANT = 3.0
+"""Standard deviations by which a size differs from zero before a warning is given of it."""
+UNTOLD = ("current_offset", "vc", "eccentric_phase")
+"""Parameters omitted from messages about their component."""
+DISAGREEMENT = 2.5
+"""Scatter between parts of a record, over chance, that is said."""
+FINE = 0.02
+"""Relative standard deviation by such a scatter up to which a number serves all the same."""
+UNUSABLE = 0.2
+"""Relative standard deviation by such a scatter from which a number is unreliable."""
+
+
+@dataclass(frozen=True, eq=False)
+class Judged:
+    """Fit and quantities of an estimate, for its findings."""
+
+    group: Sequence[Record]
+    data: Data
+    found: Fit
+    parts: Sequence[Contribution]
+    scatters: Sequence[Scatter]
+    levels: Levels
+    answer: Answer
+    percent: FitPercent
+    tests: ResidualTests
+    known: Mapping[str, float]
+
+    @property
+    def top(self) -> float:
+        """Largest command [V]."""
+        return self.data.volts
+
+    def quantity(self, name: str) -> Quantity | None:
+        """Return a quantity that has a value."""
+        found = self.answer.combinations.get(name) or self.answer.parameters.get(name)
+        return found if found is not None and found.value is not None else None
+
+    @property
+    def within_resolution(self) -> bool:
+        """Whether the residual is no more than the resolution of the sensor."""
+        own = self.data.quantum / math.sqrt(12)
+        left = self.data.motion - self.found.motion
+        return own > 0 and float(np.nanstd(left)) < math.sqrt(limits.UNEXPLAINED.value) * own
+
+
+def refuse(judged: Judged) -> None:
+    """Refuse an estimate that does not explain the recording."""
+    fitted = max(judged.percent.estimation or 0.0, explained(judged.data, judged.found.motion))
+    where = where_of(judged.group)
+    enough = fitted >= limits.WORST_FIT.value or judged.within_resolution
+    if not enough and not _nearly_constant(judged):
+        if white_share(judged.data) > STANDING:
+            raise InsufficientExcitationError(
+                f"{where}: the motor is at rest, its sensor shows only noise; raise the voltage"
+            )
+        if _is_angle(judged.group):
+            raise SignalError(
+                f"{where}: the speed follows the voltage as an angle does; map it as position"
+            )
+        raise SignalError(
+            f"{where}: the voltage does not explain the motion (fit {fitted:.0f} %); check "
+            "that voltage and encoder belong to the same motor, that the driver applies the "
+            "command, and that nothing else drives the motor"
+        )
+    offset = abs(judged.found.chain.values.get("current_offset", 0.0))
+    if offset and judged.data.current is not None:
+        largest = float(np.nanmax(np.abs(judged.data.current)))
+        if offset > limits.LARGEST_OFFSET.value * max(largest - offset, 1e-12):
+            raise CurrentError(
+                f"{where}: current has an offset of {offset:.3g} A where it reaches "
+                f"{largest:.3g} A; zero the current sensor at rest and record again"
+            )
+    if judged.quantity("dc_gain") is None and judged.quantity("steady_speed") is None:
+        raise InsufficientExcitationError(
+            f"{where}: the data do not determine the DC gain; record a longer excitation with "
+            "several frequencies, in both directions and well above the friction"
+        )
+
+
+def _is_angle(group: Sequence[Record]) -> bool:
+    """Tell whether a mapped speed is explained by a motor's angle."""
+    if any(r.velocity is None or r.count is not None or r.position is not None for r in group):
+        return False
+    angles = [replace(r, velocity=None, position=r.velocity) for r in group]
+    data = prepare(angles, use_current=False)
+    best = guesses(data, 1)
+    if not best:
+        return False
+    found = fit(data, best[0], data.scales(1.0), data.initial, rounds=1)
+    return explained(data, found.motion) > limits.FIT_EXPLAINS.value
+
+
+def _nearly_constant(judged: Judged) -> bool:
+    """Tell whether the speed hardly changes: its scatter is the sensor's, and no share tells."""
+    speed = judged.data.speed[np.isfinite(judged.data.speed)]
+    size = float(np.sqrt(np.mean(np.square(speed)))) if speed.size else 0.0
+    return size > 0 and float(np.std(speed)) < 0.1 * size
+
+
+def findings_of(judged: Judged) -> list[Finding]:
+    """Return the findings on an estimate, the gravest kinds first."""
+    return [
+        *_fit(judged),
+        *_disagreement(judged),
+        *_lag_unknown(judged),
+        *_friction_dominates(judged),
+        *_plausible(judged),
+        *_chain(judged),
+        *_levels(judged),
+        *_driving_load(judged),
+        *_current_offset(judged),
+        *_current_scale(judged),
+        *_torque_noise(judged),
+        *_separable(judged),
+    ]
+
+
+def _fit(judged: Judged) -> Iterator[Finding]:
+    estimation, validation = judged.percent.estimation or 0.0, judged.percent.validation
+    estimation = max(estimation, explained(judged.data, judged.found.motion))
+    if estimation < limits.FIT_EXPLAINS.value and not judged.within_resolution:
+        yield Finding(
+            "poor_fit", "unreliable",
+            f"the model explains {estimation:.0f} % of the speed; at least "
+            f"{limits.FIT_EXPLAINS.value:.0f} % are expected",
+            {"fit_percent": estimation, "limit": limits.FIT_EXPLAINS.value},
+            "look for another drive of the motor, and record the driver's output voltage",
+        )  # fmt: skip
+    fitted = judged.percent.estimation or 0.0
+    falls = validation is not None and validation < fitted - limits.FIT_HOLDS.value
+    if falls and not judged.within_resolution:
+        yield Finding(
+            "validation", "unreliable",
+            f"the model explains {validation:.0f} % of the held-out speed and {fitted:.0f} % "
+            "of the fitted one: the motor or its load changed, or the excitation was too poor",
+            {"estimation": fitted, "validation": validation},
+            "record 20 s or more of one excitation under one load",
+        )  # fmt: skip
+
+
+def _disagreement(judged: Judged) -> Iterator[Finding]:
+    """Report significantly different parameters in parts of a record."""
+    worst = max(judged.scatters, key=lambda s: s.ratio, default=None)
+    if worst is None or worst.ratio < DISAGREEMENT:
+        return
+    spread = max(
+        (q.std or 0.0) / abs(q.value or 1.0)
+        for n in ("steady_speed" if judged.levels.steady else "dc_gain", "time_constant")
+        if (q := judged.quantity(n)) is not None
+    ) if judged.quantity("dc_gain") else 1.0  # fmt: skip
+    parts = {"autocorrelation": "stretches of the record", "speed": "slow and fast motion",
+             "acceleration": "steady and changing motion"}  # fmt: skip
+    yield Finding(
+        "misfit", "unreliable" if spread > UNUSABLE else "warning" if spread > FINE else "note",
+        f"{parts[worst.name]} disagree {math.sqrt(worst.ratio):.1f} times more than noise explains:"
+        f" the model lacks an effect, and the intervals are widened to {100 * spread:.2g} %",
+        {"ratio": worst.ratio, "partition": worst.name, "spread": spread},
+        "record the driver's output voltage, the current, and one excitation under one load",
+    )  # fmt: skip
+
+
+def _lag_unknown(judged: Judged) -> Iterator[Finding]:
+    lag = judged.answer.combinations.get("time_constant")
+    if lag is None or lag.value is not None or lag.ci95 is None:
+        return
+    low, high = lag.ci95
+    quick = high < judged.data.rows.step
+    yield Finding(
+        "lag_unknown", "warning" if quick else "unreliable",
+        f"the time constant is only known to lie between {low:.3g} and {high:.3g} s",
+        {"low": low, "high": high, "sample_time": judged.data.rows.step},
+        "sample faster" if quick else
+        "record longer, with several frequencies, in both directions and well above friction",
+        ("time_constant", "time_constant_product"),
+    )  # fmt: skip
+
+
+def _friction_dominates(judged: Judged) -> Iterator[Finding]:
+    static = judged.quantity("static_voltage")
+    if static is None or (static.value or 0.0) <= FRICTION_MOST.value * judged.top:
+        return
+    yield Finding(
+        "friction_dominates", "unreliable",
+        f"friction takes {static.value:.3g} V of at most {judged.top:.3g} V; a driver that coasts "
+        "between its pulses, a dead zone or a jammed gear has the same effect",
+        {"static_voltage": static.value, "largest": judged.top},
+        "drive with more voltage, let the driver brake between its pulses (slow decay), or record "
+        "the voltage at the terminals",
+    )  # fmt: skip
+
+
+def _plausible(judged: Judged) -> Iterator[Finding]:
+    gain, lag = judged.quantity("dc_gain"), judged.quantity("time_constant")
+    static = judged.quantity("static_voltage")
+    if gain is None or lag is None:
+        return
+    friction = 0.0 if static is None else float(static.value or 0.0)
+    yield from implausible_motor(
+        judged.group, float(gain.value or 0.0), float(lag.value or 0.0), friction
+    )
+
+
+def _chain(judged: Judged) -> Iterator[Finding]:
+    """Name every component beyond the plain motor, with its size."""
+    for one in judged.found.chain.components:
+        if one.code in PLAIN:
+            continue
+        sizes = [text for p in one.parameters if (text := _size(judged, p))]
+        article = "an" if one.title[0] in "aeiou" else "a"
+        text = f"the recording shows {article} {one.title}" + (
+            f": {', '.join(sizes)}" if sizes else ""
+        )
+        evidence: dict[str, float | str | None] = {
+            REPORTED.get(p.name, p.name): judged.found.chain.values[p.name] for p in one.parameters
+        }
+        severity = one.severity if _significant(judged, one) else "note"
+        yield Finding(one.code, severity, text, evidence, one.advice)
+
+
+def _significant(judged: Judged, one: Component) -> bool:
+    """Tell whether some parameter of a component differs from that without effect."""
+    for p in one.parameters:
+        if p.name in judged.found.names:
+            k = judged.found.names.index(p.name)
+            variance = sum(float(part.covariance[k, k]) for part in judged.parts)
+            off = judged.found.chain.values[p.name] - p.neutral * judged.found.scales.of(p.unit)
+            if abs(off) > SIGNIFICANT * math.sqrt(variance):
+                return True
+    return not any(p.name in judged.found.names for p in one.parameters)
+
+
+def _size(judged: Judged, parameter: Parameter) -> str:
+    """Return a parameter of a component in words, with its deviation and unit."""
+    name = parameter.name
+    if name in UNTOLD or name not in judged.found.names:
+        return ""
+    reported = judged.quantity(REPORTED.get(name, ""))
+    if reported is not None:
+        name, unit = REPORTED[name], UNITS[REPORTED[name]]
+        value, std = reported.value or 0.0, reported.std or 0.0
+    else:
+        k, unit = judged.found.names.index(name), parameter.unit
+        value = judged.found.chain.values[name]
+        std = math.sqrt(max(sum(float(p.covariance[k, k]) for p in judged.parts), 0.0))
+    shown = "" if unit == "1" else f" {unit}"
+    return f"{name.replace('_', ' ')} {value:.3g} ± {std:.2g}{shown}"
+
+
+def _levels(judged: Judged) -> Iterator[Finding]:
+    levels = judged.levels
+    if levels.steady:
+        speed = judged.quantity("steady_speed")
+        if speed is not None:
+            yield Finding(
+                "one_level", "warning",
+                f"one level of voltage, {levels.steady:.3g} V, determines the steady speed "
+                f"({speed.value:.4g} ± {speed.std or 0.0:.2g} rad/s), but not gain and friction "
+                "separately",
+                {"voltage": levels.steady, "steady_speed": speed.value},
+                "record two levels of voltage, or a reversal",
+            )  # fmt: skip
+    elif levels.one_size:
+        gain = judged.answer.combinations.get("dc_gain")
+        shares = [s.share for s in gain.systematic if s.share] if gain is not None else []
+        share = max(shares, default=0.0)
+        yield Finding(
+            "one_size_of_voltage", "warning",
+            f"all voltages have the size {levels.one_size:.3g} V: gain and time constant are valid "
+            f"there, and the gain may differ by {100 * share:.2g} % at others",
+            {"voltage": levels.one_size, "share": share},
+            "add levels of other sizes, or record the voltage at the terminals and state its "
+            "accuracy",
+        )  # fmt: skip
+    elif levels.one_step:
+        yield Finding(
+            "one_size_of_step", "note",
+            f"all steps have the size {levels.one_step:.3g} V, so a driver's ramp looks like a "
+            "delay",
+            {"voltage": levels.one_step}, "add steps of other sizes",
+        )  # fmt: skip
+    if levels.one_way and not levels.steady:
+        yield Finding(
+            "one_direction", "warning",
+            "the motor was driven in one direction: the static voltage includes a constant load",
+            {"voltage": levels.one_size or judged.top}, "drive both directions",
+        )  # fmt: skip
+
+
+def _driving_load(judged: Judged) -> Iterator[Finding]:
+    """Report a load that drives the motor, found with one direction of motion."""
+    load, command = judged.quantity("load_voltage"), judged.data.rows.command
+    if not judged.levels.one_way or load is None or load.value is None:
+        return
+    way = math.copysign(1.0, command[int(np.argmax(np.abs(command)))])
+    if way * load.value < -2 * (load.std or 0.0):
+        yield Finding(
+            "driving_load", "unreliable",
+            "the motor responds to changes of the voltage by less than its steady speed requires: "
+            f"a load of {abs(load.value):.3g} V seems to drive it",
+            {"load_voltage": load.value},
+            "drive both directions, or record the voltage at the terminals",
+        )  # fmt: skip
+
+
+def _current_offset(judged: Judged) -> Iterator[Finding]:
+    """Say which offset of the current's sensor was taken out."""
+    names, current = judged.found.names, judged.data.current
+    if current is None or "current_offset" not in names:
+        return
+    offset = judged.found.chain.values["current_offset"]
+    k = names.index("current_offset")
+    std = math.sqrt(sum(p.covariance[k, k] for p in judged.parts))
+    if abs(offset) > max(4 * std, 0.01 * float(np.nanmax(np.abs(current)))):
+        yield Finding(
+            "current_offset", "note",
+            f"the current has an offset of {offset:.3g} ± {std:.1g} A, which was taken out",
+            {"offset": offset}, "zero the current sensor at rest",
+        )  # fmt: skip
+
+
+def _current_scale(judged: Judged) -> Iterator[Finding]:
+    """Report the effect of the current's scale, compared with an ohmmeter if given."""
+    known = [
+        n for n in BY_CURRENT if (q := judged.quantity(n)) is not None and q.status == "estimated"
+    ]
+    if "resistance" not in known:
+        return
+    ohmmeter = judged.group[0].hardware.resistance
+    found = judged.quantity("resistance")
+    evidence: dict[str, float | str | None] = {"of_the_scale": ", ".join(known)}
+    names = ", ".join(n.replace("_", " ") for n in known)
+    text = f"{names} scale with the current sensor"
+    if not ohmmeter or found is None or found.value is None:
+        share = max((s.share or 0.0 for s in found.systematic if s.cause == "current_scale"),
+                    default=0.0) if found else 0.0  # fmt: skip
+        one_size = judged.levels.one_size > 0
+        if one_size:
+            text += ", or with the duty cycle if it measures the supply"
+        yield Finding(
+            "current_scale", "warning" if one_size else "note",
+            f"{text}, assumed accurate to {100 * share:.2g} %", evidence,
+            "state the sensor's accuracy (`current_accuracy`), or measure the resistance by "
+            "ohmmeter (`resistance`)",
+        )  # fmt: skip
+        return
+    scale = ohmmeter / found.value
+    far = limits.RESISTANCE_BAND.value + limits.HALF_WIDTH.value * (found.std or 0.0) / found.value
+    off = abs(scale - 1) > far
+    yield Finding(
+        "current_scale", "unreliable" if off else "note",
+        f"{text}: by the ohmmeter's {ohmmeter:.4g} ohm its scale is {scale:.3g}",
+        {**evidence, "scale": scale, "ohmmeter": ohmmeter},
+        "calibrate the current sensor, or measure the resistance warm" if off else "",
+        tuple(known),
+    )  # fmt: skip
+
+
+def _torque_noise(judged: Judged) -> Iterator[Finding]:
+    """Report a fluctuating load: coloured noise of the speed beyond the sensor's."""
+    acceleration = acceleration_noise(judged.data, judged.found)
+    if acceleration <= 0:
+        return
+    yield Finding(
+        "torque_noise", "note",
+        f"the load fluctuates: the acceleration scatters by {acceleration:.3g} rad/s^2 over a "
+        "second",
+        {"acceleration": acceleration},
+    )  # fmt: skip
+
+
+def acceleration_noise(data: Data, found: Fit) -> float:
+    """Return the density of a fluctuating acceleration [rad/s^2 s^0.5], 0 where none shows.
+
+    A speed that forgets within tau has the variance ``a^2 tau / 2`` of white acceleration a.
+    """
+    if found.noise[0].order == 0:
+        return 0.0
+    step, at = data.rows.step, data.known[0]
+    width = max(int(found.scales.lag / step / 4), 1)
+    if at.size < 4 * width:
+        return 0.0
+    filled = np.interp(np.arange(len(data)), at, (data.motion - found.motion)[at])
+    if data.is_angle:
+        filled = np.diff(filled) / step
+    smooth = np.convolve(filled, np.ones(width) / width, mode="valid")
+    white = float(np.var(np.diff(filled))) / 2 / width
+    variance = float(np.var(smooth)) - (white / width if data.is_angle else white)
+    if variance <= 0.5 * float(np.var(smooth)):
+        return 0.0
+    return math.sqrt(2 * variance / found.scales.lag)
+
+
+def _separable(judged: Judged) -> Iterator[Finding]:
+    missing = [n for n in PHYSICAL if judged.answer.parameters[n].status == "unidentifiable"]
+    if not missing:
+        return
+    names = ", ".join(n.replace("_", " ") for n in missing)
+    if judged.data.current is None:
+        yield Finding(
+            "not_separable", "note",
+            f"voltage and speed alone cannot separate {names}: many motors respond alike",
+            {}, "record the motor current too; the combinations are known",
+        )  # fmt: skip
+    else:
+        yield Finding(
+            "weak_excitation", "note", f"these data do not identify {names}", {},
+            "sample faster, and excite harder, over more frequencies and in both directions",
+        )  # fmt: skip

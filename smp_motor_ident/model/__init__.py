@@ -1,1 +1,0 @@
-"""What a motor may be: candidate structures and their parameters."""

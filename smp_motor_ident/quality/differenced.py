@@ -1,0 +1,163 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A speed that is the difference of a coarse counter's counts over one sample: its counts again.
+
+The rounding error of a count enters two neighbouring speeds with opposite signs, so their errors
+are correlated by -1/2 and sum up to that of one count.  Treated as independent errors of the speed
+they would be far overestimated, and a loop that responds to them would bias the fit.  Differences
+over m samples sum up to m counts in a row with m times the error; a fitted motor whose residual is
+one count's rounding identifies m.
+
+A difference over the time that it took is the speed, over the nominal period of a loop that is late
+it is as much too large as that interval is too long: neighbouring speeds then differ as their
+intervals do, which those of a motor do not.
+
+References
+----------
+L. Ljung, System Identification, 2nd ed. (1999), section 13.4 (noise that a loop feeds back).
+"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from scipy.signal import savgol_coeffs, savgol_filter
+
+from smp_motor_control.arrays import Array
+from smp_motor_ident.finding import Finding
+from smp_motor_ident.quality.limits import FEWEST, NEIGHBOURS, ONE_COUNT, SIGN_SURE
+from smp_motor_ident.quality.resolution import speed_quantum
+from smp_motor_ident.quality.sample_limits import BEAT_JITTER, COUNTS_A_SAMPLE, NOMINAL_PERIOD
+from smp_motor_ident.record import Record
+
+SMOOTH = 9  # samples of a moving mean that keeps the motion and removes the rounding
+LOCAL = 15  # samples over which a motion is a cubic
+SLOW = 100  # largest counts per interval at which the speed's steps show
+LONGER = 2.0  # times the usual interval: longer ones are gaps
+EVEN = 0.5  # of the usual interval: stamps that are off by more may hide a lost sample
+
+
+def counts_again(group: Sequence[Record]) -> list[Record]:
+    """Return records with the angles that their speeds are the differences of, if all are."""
+    summed = [_summed(r) for r in group]
+    return list(group) if any(s is r for s, r in zip(summed, group, strict=True)) else summed
+
+
+def _summed(record: Record) -> Record:
+    velocity = record.velocity
+    if velocity is None or record.count is not None or record.position is not None:
+        return record
+    quantum, step = speed_quantum(velocity), record.sample_time
+    if quantum == 0.0 or not np.isfinite(velocity).all():
+        return record
+    intervals = np.delete(np.diff(record.time), [s - 1 for s in record.starts if s > 0])
+    moved = np.rint(velocity / quantum)
+    if np.abs(intervals - step).max() > EVEN * step or not _against_each_other(moved):
+        return record
+    angle = np.cumsum(moved) * quantum * step
+    if not _smooth_but_for_one(moved):
+        return record
+    found = Finding(
+        "speed_summed",
+        "note",
+        f"the speed has steps of {quantum:.4g} rad/s, one count per sample: it is a difference of "
+        "counts, which are used instead",
+        {"quantum": quantum},
+        "record the encoder's counts",
+    )
+    return replace(
+        record,
+        position=angle,
+        velocity_window=step,
+        findings=(*record.findings, found),
+    )
+
+
+def rounding(record: Record) -> float:
+    """Return the deviation [rad] of the counts that a speed was made of, 0 where it is another."""
+    found = next((f for f in record.findings if f.code == "speed_summed"), None)
+    if found is None:
+        return 0.0
+    return float(found.evidence["quantum"] or 0.0) * record.velocity_window / 12**0.5
+
+
+def _smooth_but_for_one(moved: Array) -> bool:
+    """Tell whether counts, where they change, leave a cubic over some samples by one's rounding.
+
+    Of more than a few counts a sample the speed itself can be read, whatever else moves the motor.
+    """
+    if moved.size < LOCAL or np.abs(moved).max() > COUNTS_A_SAMPLE.value:
+        return False
+    count = np.cumsum(moved)
+    rest = count - savgol_filter(count, LOCAL, 3)
+    turns = np.convolve(moved != 0, np.ones(LOCAL), "same") > 1
+    left = 1 - float(savgol_coeffs(LOCAL, 3)[LOCAL // 2])  # of a white error
+    return bool(turns.any() and np.mean(np.square(rest[turns])) < ONE_COUNT.value * left / 12)
+
+
+def _against_each_other(moved: Array) -> bool:
+    """Tell by the correlation of neighbours after removing the smooth motion."""
+    smooth = np.convolve(moved, np.full(SMOOTH, 1 / SMOOTH), "same")
+    rest = (moved - smooth)[SMOOTH:-SMOOTH]
+    size = float(rest @ rest)
+    return size > 0.0 and float(rest[1:] @ rest[:-1]) < NEIGHBOURS.value * size
+
+
+def over_real_intervals(record: Record) -> Record:
+    """Return a record whose speed was divided by a nominal period with that by the real ones.
+
+    The period is that of the counts a turn where they are known, else the mean interval, which may
+    be another.
+    """
+    velocity, interval = record.velocity, np.diff(record.time, prepend=np.nan)
+    if velocity is None or record.count is not None or record.position is not None:
+        return record
+    interval[list(record.starts)] = np.nan
+    if not _as_intervals(velocity, interval):
+        return record
+    mean, shortest = float(np.nanmean(interval)), float(np.nanpercentile(interval, 5))
+    counted = _period(velocity, record.hardware.counts_per_revolution, mean)
+    known = shortest / LONGER < counted < mean * LONGER
+    period = counted if known else mean
+    words = "the speed is counts over a nominal period instead of the actual intervals"
+    found = Finding(
+        "nominal_period",
+        "warning" if known else "unreliable",
+        f"{words}: it was corrected for a period of {1e3 * period:.4g} ms"
+        + ("" if known else f", the mean one; for {1e3 * shortest:.4g} ms it would be "
+           f"{1 - shortest / mean:.0%} less"),
+        {"period": period, "shortest": shortest},
+        "record the encoder's counts" + ("" if known else ", or map counts_per_revolution=N"),
+    )  # fmt: skip
+    real = velocity * period / interval
+    return replace(record, velocity=real, velocity_window=mean, findings=(*record.findings, found))
+
+
+def _period(velocity: Array, per_turn: float | None, usual: float) -> float:
+    """Return over which period a count is the step in which slow speeds come, 0 if unknown."""
+    if not per_turn:
+        return 0.0
+    slow = np.abs(velocity) < SLOW * 2 * np.pi / per_turn / usual
+    quantum = speed_quantum(velocity[slow])
+    return 2 * np.pi / per_turn / quantum if quantum else 0.0
+
+
+def _as_intervals(velocity: Array, interval: Array) -> bool:
+    """Tell whether speeds differ from the mean of their neighbours as their intervals do.
+
+    That is the slope of a line: one of counts over a nominal period, nothing of a motor's speed.
+    """
+    known = np.isfinite(velocity) & np.isfinite(interval)
+    speed, took = velocity[known], interval[known]
+    if speed.size < FEWEST.value or np.std(took) < BEAT_JITTER.value * np.median(took):
+        return False
+    took = np.minimum(took, LONGER * np.median(took))  # the motion in a gap is unknown
+    window = np.full(SMOOTH, 1 / SMOOTH)
+    mean, usual = (np.convolve(x, window, "same") for x in (speed, took))
+    inner = slice(SMOOTH, -SMOOTH)
+    x, y = (mean * (took / usual - 1))[inner], (speed - mean)[inner]
+    power = float(x @ x)
+    if power <= 0:
+        return False
+    slope = float(x @ y) / power
+    std = float(np.linalg.norm((y - slope * x) * x)) / power
+    return slope - SIGN_SURE.value * std > NOMINAL_PERIOD.value

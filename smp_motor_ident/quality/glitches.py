@@ -1,0 +1,92 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Remove readings of speed and angle that jump away and back within one sample.
+
+In white noise two of three readings exceed both neighbours; ten times the upper quartile of this
+excess (the smaller of the two differences) is some nine standard deviations of the noise, or ten
+quanta of a quantised signal, which chance does not reach.
+"""
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from smp_motor_control.arrays import Array, Flags
+from smp_motor_ident.finding import Finding
+from smp_motor_ident.quality.sample_limits import GLITCH, GLITCHES
+from smp_motor_ident.record import Record
+
+SHARE = 0.05  # of the signal's range, and of the voltage's: less is no glitch, and no pulse
+CHANGES = 4.0  # usual changes from one reading to the next: a counter dithers by one or two
+ENOUGH = 4_000  # readings used for the usual change
+PASSES = 4  # each finds one of several in a row
+
+
+def without_glitches(record: Record) -> Record:
+    """Return a record without readings of speed and angle that jump away and back."""
+    if record.count is not None and record.hardware.counts_per_revolution:
+        return record
+    pulsed = _pulses(record.voltage)
+    for name in ("velocity", "position"):
+        values = getattr(record, name)
+        if values is None:
+            continue
+        wrong = _glitches(values, pulsed)
+        if not wrong.any() or wrong.mean() > GLITCHES.value:
+            continue
+        first = int(np.argmax(wrong))
+        found = Finding(
+            "glitches",
+            "warning",
+            f"{name} jumps away and back within one sample in {int(wrong.sum())} places (first at "
+            f"{record.time[first]:.4g} s, {values[first]:.4g}): these readings were left out",
+            {"signal": name, "samples": float(wrong.sum())},
+            "look for a loose cable, or for overwritten messages",
+        )
+        left: Any = {name: np.where(wrong, np.nan, values)}
+        record = replace(record, findings=(*record.findings, found), **left)
+    return record
+
+
+def glitches_of(record: Record, name: str) -> int:
+    """Return the number of readings of a signal that were left out."""
+    said = [f.evidence for f in record.findings if f.code == "glitches"]
+    return sum(int(e["samples"] or 0) for e in said if e["signal"] == name)
+
+
+def _glitches(values: Array, pulsed: Flags) -> Flags:
+    wrong = np.zeros(values.size, dtype=np.bool_)
+    for _ in range(PASSES):
+        at = np.flatnonzero(np.isfinite(values) & ~wrong)
+        beyond = _beyond(values[at])
+        if beyond.size < 8 or not beyond.any():
+            break
+        some = slice(None, None, 1 + at.size // ENOUGH)
+        low, high = np.percentile(values[at][some], (1, 99))
+        moves = np.abs(np.diff(values[at]))[some]
+        least = max(
+            GLITCH.value * float(np.percentile(beyond[some], 75)),
+            CHANGES * float(np.median(moves[moves > 0])) if moves.any() else 0.0,
+            SHARE * float(high - low),
+        )
+        found = at[1:-1][beyond > least]
+        found = found[~pulsed[found]]
+        if not found.size:
+            break
+        wrong[found] = True
+    return wrong
+
+
+def _beyond(values: Array) -> Array:
+    """Return the excess of readings over both of their neighbours, shape (n - 2,)."""
+    before, after = values[1:-1] - values[:-2], values[1:-1] - values[2:]
+    same = np.sign(before) == np.sign(after)
+    return np.where(same, np.minimum(np.abs(before), np.abs(after)), 0.0)
+
+
+def _pulses(voltage: Array) -> Flags:
+    """Mark the rows next to a one-sample voltage pulse, which a fast motor follows."""
+    pulse = np.zeros(voltage.size, dtype=np.bool_)
+    pulse[1:-1] = _beyond(voltage) > SHARE * float(np.ptp(voltage))
+    near: Flags = np.convolve(pulse, np.ones(5), "same") > 0
+    return near

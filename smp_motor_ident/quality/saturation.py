@@ -1,0 +1,101 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Detect saturated sensors, and tell them from a regulated current."""
+
+from collections.abc import Iterator
+
+import numpy as np
+from scipy.ndimage import uniform_filter1d
+
+from smp_motor_control.arrays import Array, Flags
+from smp_motor_ident.errors import SignalError
+from smp_motor_ident.finding import Finding
+from smp_motor_ident.quality import limits
+from smp_motor_ident.quality.sample_limits import REGULATED
+from smp_motor_ident.record import Record
+
+SMOOTH = 9  # samples of a moving mean that keeps the motion of a speed from counts
+
+
+def saturation(record: Record, speed: Array, where: str) -> Iterator[Finding]:
+    """Refuse a speed or current that rests at its limit while the voltage moves.
+
+    Yield a finding for a current that a driver regulates.
+    """
+    regulated = 0.0
+    for name, unit in (("velocity", "rad/s"), ("current", "A")):
+        values = getattr(record, name)
+        if values is None:
+            continue
+        ok = np.isfinite(values)
+        x, v = values[ok], record.voltage[ok]
+        levels, times = np.unique(x, return_counts=True)
+        if x.size < 50 or levels.size < 20 or _one_level(v):
+            continue
+        for limit in (x.max(), x.min()):
+            at = x == limit
+            if abs(limit) < 0.5 * np.abs(x).max():  # the slowest that it turned, one way
+                continue
+            share = float(at.mean())
+            next_times = times[-2] if limit == levels[-1] else times[1]
+            runs = at[1:] & at[:-1]
+            # A saturated sensor shows its limit far more often than the next level.
+            if share < 0.01 or at.sum() < 5 * next_times or runs.sum() < 0.5 * at.sum():
+                continue
+            # The last samples of a rest may be late, of a voltage that has moved since.
+            late = int(limits.LATE_ROWS.value)
+            early = at & np.append(at[late:], [False] * late)
+            if early.sum() < limits.AT_LIMIT.value:
+                continue
+            low, high = np.percentile(v[early], [5, 95])
+            if high - low < 10 * limits.METER.value * np.ptp(v) and not _abrupt(x, at):
+                continue
+            if name == "current" and _holds(record.current == limit, record.voltage, speed):
+                regulated = max(regulated, abs(float(limit)))
+                continue
+            raise SignalError(
+                f"{where}: saturated sensor, {name} rests at {limit:.4g} {unit} in "
+                f"{share:.1%} of the samples while the voltage moves; widen its range or "
+                "lower the excitation"
+            )
+    if regulated:
+        yield _regulated(regulated)
+
+
+def _regulated(current: float) -> Finding:
+    """Report the effect of a current-regulating driver on the estimate."""
+    return Finding(
+        "current_regulated",
+        "warning",
+        f"the current rests at {current:.4g} A while the voltage follows the speed: a driver "
+        "regulates it, and its rise time appears as the winding's lag (inductance, product of the "
+        "time constants)",
+        {"current": current, "quantity": "inductance"},
+        "to identify the inductance, record with a driver that follows a command in volts",
+    )
+
+
+def _holds(rests: Flags, voltage: Array, speed: Array) -> bool:
+    """Tell whether the voltage fits the speed at a constant current, ``v = R i + K w``.
+
+    Behind a clipped sensor the current varies, and the voltage does not fit.
+    """
+    smooth = uniform_filter1d(np.nan_to_num(speed), SMOOTH)
+    v, w = voltage[rests], smooth[rests]
+    v, w = v - v.mean(), w - w.mean()
+    both = float(v @ w)
+    return both > 0 and both**2 > REGULATED.value * float((v @ v) * (w @ w))
+
+
+def _one_level(v: Array) -> bool:
+    """Tell whether the motor is driven by one level of voltage, at which it may come to rest."""
+    driven = v[np.abs(v) > limits.REST.value * np.abs(v).max()]
+    return not driven.size or bool(np.ptp(driven) < 10 * limits.METER.value * np.abs(driven).max())
+
+
+def _abrupt(x: Array, at: Flags) -> bool:
+    """Tell a clipped signal from one that settles: it jumps to its limit, scatters elsewhere."""
+    enters = np.flatnonzero(at[1:] & ~at[:-1]) + 1
+    rest = x[(x != x.max()) & (x != x.min())]
+    if not enters.size or np.unique(rest).size < 0.5 * rest.size:
+        return False
+    return bool(np.median(np.abs(x[enters] - x[enters - 1])) > 1e-3 * np.ptp(x))

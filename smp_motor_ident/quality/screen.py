@@ -1,0 +1,308 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Detect and name bad data before any estimation."""
+
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+
+from smp_motor_control.arrays import Array
+from smp_motor_ident.errors import CurrentError, InsufficientExcitationError, SignalError
+from smp_motor_ident.finding import Finding
+from smp_motor_ident.quality import limits
+from smp_motor_ident.quality.edge_timer import held_of
+from smp_motor_ident.quality.glitches import glitches_of
+from smp_motor_ident.quality.saturation import saturation
+from smp_motor_ident.quality.signs import likeness, lost_sign
+from smp_motor_ident.quality.silence import silent
+from smp_motor_ident.quality.units import (
+    cause_of_ratio,
+    implausible_voltage,
+    one_unit_of_time,
+)
+from smp_motor_ident.record import Record
+
+RUNS = 2_000  # runs of samples in which signals are averaged before they are compared
+INSTRUMENTS = 8  # lags of the voltage whose sum models the motor's response
+RUN_CORRELATION = 20.0  # largest variance inflation by correlated errors of neighbouring runs
+
+
+def screen(records: Sequence[Record]) -> list[Finding]:
+    """Refuse records without a valid estimate; name the reason and the remedy."""
+    warnings = implausible_voltage(records)
+    where = where_of(records)
+    one_unit_of_time(records)
+    _length(records, where)
+    for record in records:
+        warnings += _lost(record)
+    _resolution(records, where)
+    lost_sign(records, [measured_speed(r) for r in records], where)
+    _excitation(records, where)
+    for record in records:
+        warnings += saturation(record, measured_speed(record), where_of([record]))
+        _ratio(record)
+    _standing(records, where)
+    for record in records:
+        silent(record, where_of([record]))
+    _motion(records, where)
+    _signs(records, where)
+    for record in _turning(records):  # the many do not hide the one
+        _signs([record], where_of([record]), late=False)
+    read = [finding for record in records for finding in record.findings]
+    return [*warnings, *(f for k, f in enumerate(read) if f not in read[:k])]
+
+
+def _resolution(records: Sequence[Record], where: str) -> None:
+    if any(np.isfinite(measured_speed(r)).any() for r in records):
+        return
+    if any(r.count is not None and not r.hardware.counts_per_revolution for r in records):
+        raise SignalError(
+            f"{where}: the counts per revolution are unknown; map counts_per_revolution=N"
+        )
+
+
+def where_of(records: Sequence[Record]) -> str:
+    """Return files and wheel in words."""
+    sources = ", ".join(dict.fromkeys(r.source for r in records if r.source))
+    return f"{sources or 'record'}: {records[0].wheel}"
+
+
+def _length(records: Sequence[Record], where: str) -> None:
+    samples = sum(len(r) for r in records)
+    if samples < limits.FEWEST.value:
+        duration = sum(r.duration for r in records)
+        raise InsufficientExcitationError(
+            f"{where}: too short, {samples} samples in {duration:.3g} s; record at least "
+            f"{limits.FEWEST.value:.0f} samples (faster, or the same again), better 20 s or more "
+            "with a changing voltage"
+        )
+
+
+def _lost(record: Record) -> Iterator[Finding]:
+    where = where_of([record])
+    for name in ("velocity", "position"):
+        values = getattr(record, name)
+        if values is None or (record.count is not None and record.hardware.counts_per_revolution):
+            continue
+        lost = float(np.mean(~np.isfinite(values)))
+        lost -= held_of(record) if name == "velocity" else 0.0  # which is said already
+        if lost > limits.MOST_LOST.value and (name == "velocity" or record.velocity is None):
+            raise SignalError(
+                f"{where}: {name} is NaN in {lost:.0%} of the samples; "
+                "repair the sensor or its connection and record again"
+            )
+        lost -= glitches_of(record, name) / len(record)  # which are said already
+        if lost > 0:
+            yield _left_out(name, lost)
+    if record.current is not None:
+        lost = float(np.mean(~np.isfinite(record.current)))
+        if 0 < lost < 1:
+            yield _left_out("current", lost)
+
+
+def _left_out(name: str, lost: float) -> Finding:
+    message = f"{name} is NaN in {lost:.1%} of the samples; they were left out"
+    return Finding("samples_lost", "warning", message, {"signal": name, "share": lost})
+
+
+def _excitation(records: Sequence[Record], where: str) -> None:
+    largest = max(float(np.abs(r.voltage).max()) for r in records)
+    supply = max(r.hardware.supply_voltage or 0.0 for r in records)
+    if largest <= limits.METER.value * supply:
+        raise InsufficientExcitationError(
+            f"{where}: no excitation, the voltage stays within {largest:.3g} V of 0 V; drive the "
+            "motor with a sine, square or Fourier voltage while recording"
+        )
+    # A voltmeter's scatter around a level is not an excitation; a step is one.
+    levels = [float(np.mean(r.voltage)) for r in records]
+    still = [
+        float(np.std(r.voltage)) < limits.METER.value * abs(level)
+        and float(np.ptp(r.voltage)) < 10 * limits.METER.value * abs(level)
+        for r, level in zip(records, levels, strict=True)
+    ]
+    if (
+        all(still)
+        and float(np.ptp(levels)) < limits.METER.value * abs(levels[0])
+        and not any(_starts(r) for r in records)
+    ):
+        raise InsufficientExcitationError(
+            f"{where}: the voltage is constant at {levels[0]:.4g} V; a constant "
+            "input cannot tell dynamics: record a square or Fourier voltage in both directions"
+        )
+
+
+LEAST_MEANS = 12
+"""Of a record, from which their scatter is known."""
+
+
+def _starts(record: Record) -> bool:
+    """Tell whether a speed rises under a constant voltage: a step before the first row.
+
+    Means over several lengths are compared, since the rise may take few samples or many; their
+    noise is the scatter in the last third.
+    """
+    speed = measured_speed(record)
+    speed = speed[np.isfinite(speed)]
+    if speed.size < limits.FEWEST.value:
+        return False
+    length = 1
+    while speed.size // length >= LEAST_MEANS:
+        means = speed[: speed.size // length * length].reshape(-1, length).mean(axis=1)
+        last = means[-(len(means) // 3) :]
+        steady = float(np.mean(last))
+        rise = (steady - float(means[0])) * np.sign(steady)
+        if rise > max(0.2 * abs(steady), 6 * float(np.std(last, ddof=1))):
+            return True
+        length *= 2
+    return False
+
+
+def measured_speed(record: Record) -> Array:
+    """Return the best available speed: from counts, angle, or as recorded."""
+    per_turn = record.hardware.counts_per_revolution
+    if record.count is not None and per_turn:
+        angle = record.count * (2 * np.pi / per_turn)
+    elif record.velocity is not None:
+        return record.velocity
+    elif record.position is not None:
+        angle = record.position
+    else:
+        return np.full(len(record), np.nan)
+    speed = np.full(len(record), np.nan)
+    speed[1:] = np.diff(angle) / np.diff(record.time)
+    speed[list(record.starts)] = np.nan
+    return speed
+
+
+def _ratio(record: Record) -> None:
+    """Compare the signals of the motion with each other; refuse a ratio other than one."""
+    per_turn = record.hardware.counts_per_revolution
+    angle, what = record.position, "position"
+    if record.count is not None and per_turn:
+        angle = np.asarray(record.count * (2 * np.pi / per_turn), dtype=np.float64)
+        what = "encoder counts"
+        if record.position is not None:
+            _compare(record, angle, what, record.position, "position")
+    if angle is not None and record.velocity is not None:
+        charge = np.cumsum(record.velocity[1:] * np.diff(record.time))
+        _compare(record, angle, what, np.concatenate([[0.0], charge]), "velocity")
+
+
+def _compare(record: Record, angle: Array, what: str, other_values: Array, other: str) -> None:
+    where = where_of([record])
+    lag = max(1, min(10, len(record) // 10))
+    dt = record.time[lag:] - record.time[:-lag]
+    a, b = (angle[lag:] - angle[:-lag]) / dt, (other_values[lag:] - other_values[:-lag]) / dt
+    ok = np.isfinite(a) & np.isfinite(b)
+    for s in record.starts[1:]:
+        ok[max(0, s - lag) : s] = False
+    a, b = a[ok], b[ok]
+    if a.size < 20 or b.std() == 0:
+        return
+    if not np.any(a):
+        raise SignalError(
+            f"{where}: dead encoder, the {what} stays while the {other} "
+            f"reaches {np.abs(b).max():.3g} rad/s; check the encoder's cable"
+        )
+    together = float(a @ b / np.sqrt((a @ a) * (b @ b)))
+    if together < -0.5:
+        raise SignalError(
+            f"{where}: {what} runs against the {other} (swapped sign); exchange the "
+            f"encoder's channels A and B or the sign of the {other}"
+        )
+    if together <= 0.9:
+        return
+    # Where either is noisy, or late, their ratio lies between the two regressions (Frisch 1934).
+    low, high = float(a @ b / (a @ a)), float(b @ b / (a @ b))
+    if low > 1.05 or high < 0.95:
+        ratio = float(np.sqrt(low * high))
+        raise SignalError(
+            f"{where}: {other} is {ratio:.4g} times its value by the {what}; "
+            f"{cause_of_ratio(ratio, record.hardware)}"
+        )
+
+
+def _standing(records: Sequence[Record], where: str) -> None:
+    """Refuse a speed that stays at 0 or at a sensor's offset for any voltage."""
+    speeds = [s[np.isfinite(s)] for s in map(measured_speed, records)]
+    speeds = [s for s in speeds if s.size]
+    if not speeds or (max(map(np.ptp, speeds)) == 0 and np.ptp([s[0] for s in speeds]) == 0):
+        largest = max(float(np.abs(r.voltage).max()) for r in records)
+        level = float(speeds[0][0]) + 0.0 if speeds else 0.0  # no -0
+        raise SignalError(
+            f"{where}: a standing motor or a dead encoder: the speed stays at {level:.3g} rad/s "
+            f"while the voltage reaches {largest:.3g} V, no excitation above friction; drive "
+            "harder, or check the encoder's cable"
+        )
+
+
+def _motion(records: Sequence[Record], where: str) -> None:
+    counts = [int(np.ptp(r.count)) for r in records if r.count is not None]
+    if counts and len(counts) == len(records) and max(counts) < 20:
+        raise InsufficientExcitationError(
+            f"{where}: the motor moved by {max(counts)} encoder counts only; "
+            "excite with more voltage or for longer"
+        )
+
+
+def _signs(records: Sequence[Record], where: str, late: bool = True) -> None:
+    """Refuse speed or current that answers the voltage with the wrong sign, or so late that a late
+    answer is a reversed one.
+    """
+    for what, remedy in (
+        ("speed", "swap the motor's leads or the encoder's channels, or scale it by -1"),
+        ("current", "swap the current sensor's sign, or scale it by -1"),
+    ):
+        kept = [r for r in records if what == "speed" or r.current is not None]
+        signals = [measured_speed(r) if what == "speed" else r.current for r in kept]
+        found = likeness(kept, [s for s in signals if s is not None], lags=what == "speed")
+        if found is None:
+            continue
+        sure = limits.SIGN_SURE.value * found.chance
+        # Samples of a current between switched voltages show little of it because of the lag.
+        least = (limits.SIGN_LEAST if what == "speed" else limits.SIGN_ALIKE).value
+        if found.wrong - found.right > max(least, min(sure, limits.SIGN_ALIKE.value * found.wrong)):
+            refusal = SignalError if what == "speed" else CurrentError
+            raise refusal(
+                f"{where}: swapped sign, {what} runs against the voltage "
+                f"(correlation {-found.wrong:.2f}); {remedy}"
+            )
+        follows = found.wrong > max(least, min(sure, limits.SIGN_ALIKE.value))
+        if (
+            late
+            and what == "speed"
+            and follows
+            and found.wrong > limits.SIGN_NEARER.value * found.right
+        ):
+            raise InsufficientExcitationError(
+                f"{where}: the voltage changes too fast, with a period of {_period(records):.2g} "
+                "samples: a speed delayed by sampling, a filter or a window cannot be told from "
+                "one of opposite sign; excite more slowly"
+            )
+
+
+def _turning(records: Sequence[Record]) -> list[Record]:
+    """Return the records whose motor turned; others show only the sign of an offset."""
+    scatter = [float(np.nanstd(measured_speed(r))) for r in records]
+    return [
+        r
+        for r, s in zip(records, scatter, strict=True)
+        if len(records) > 1 and s > limits.REST.value * max(scatter)
+    ]
+
+
+def _period(records: Sequence[Record]) -> float:
+    """Return the period of the voltage's sign changes [samples]."""
+    changes = sum(np.count_nonzero(np.diff(np.sign(r.voltage))) for r in records)
+    return 2 * sum(len(r) for r in records) / max(changes, 1)
+
+
+def of_the_winding(record: Record, current: Array) -> tuple[Array, Array, Array]:
+    """Return voltage, speed and current as means over runs in which a counter's noise is small."""
+    k = max(1, len(record) // RUNS)
+    n = len(record) // k * k
+    v, w, i = (x[:n].reshape(-1, k) for x in (record.voltage, measured_speed(record), current))
+    known = np.isfinite(i) & np.isfinite(w)
+    keep = known.any(axis=1)
+    samples = np.maximum(known.sum(axis=1), 1)
+    w, i = (np.where(known, x, 0.0).sum(axis=1) / samples for x in (w, i))
+    return v.mean(axis=1)[keep], w[keep], i[keep]

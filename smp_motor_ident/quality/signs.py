@@ -1,0 +1,169 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Detect reversed and lost signs by the correlation of a signal with the lagged voltage.
+
+A motor's response lags by at most a quarter of a period, plus the delay of sampling and transport.
+Where the total is half a period, a late response cannot be told from a reversed one.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.fft import irfft, next_fast_len, rfft
+
+from smp_motor_control.arrays import Array
+from smp_motor_ident.errors import SignalError
+from smp_motor_ident.quality.lag import lagged
+from smp_motor_ident.quality.limits import (
+    BACKWARD,
+    HALF_EXPLAINED,
+    SIGN_LATE,
+    SIGN_LEAST,
+    SIGN_SURE,
+)
+from smp_motor_ident.record import Record
+
+LAGS = 16  # from a sampling interval to a quarter of the record, each 1.5 to 2 times the last
+ANSWERS = 8  # of the lags, up to a tenth of the record, for the response to an unsigned voltage
+FINE = 16  # samples that resolve a lag
+RUNS = 2_000  # stretches over which signals are averaged: in them a counter's noise is small
+WAYS = 50  # runs of a record over which its way is summed
+
+
+@dataclass(frozen=True)
+class Likeness:
+    """The largest correlations of a signal with the voltage that came through a lag."""
+
+    right: float  # as it is
+    wrong: float  # with the other sign
+    chance: float  # standard deviation of the latter, where the signals have no part in each other
+
+
+def likeness(records: Sequence[Record], signals: Sequence[Array], lags: bool) -> Likeness | None:
+    """Correlate signals with the lagged voltage; None if they are constant."""
+    pairs = [pair for r, y in zip(records, signals, strict=True) if (pair := _smooth(r, y))]
+    if not any(y.any() for _, _, y in pairs):
+        return None
+    times = [0.0]
+    if lags:
+        shortest = min(step for step, _, _ in pairs)
+        longest = max(step * v.size for step, v, _ in pairs) / 4
+        times = [0.0, *np.geomspace(shortest, max(longest, 2 * shortest), LAGS)]
+    best, worst, reverse = 0.0, 0.0, [(v, y) for _, v, y in pairs]
+    for lag in times:
+        every = max(1, int(lag / (FINE * max(step for step, _, _ in pairs))))
+        fewer = [(every * step, _every(v, every), _every(y, every)) for step, v, y in pairs]
+        power = sum(float(y @ y) for _, _, y in fewer)
+        late = [(lagged(v, lag / step), y) for step, v, y in fewer]
+        products = [
+            sum(float(x[: x.size - k] @ y[k:]) for x, y in late)
+            for k in range(int(SIGN_LATE.value / every) + 1)
+        ]
+        square = sum(float(x @ x) for x, _ in late)
+        next_to = sum(float(2 * (x[1:] @ x[:-1]) - x[-1] ** 2) for x, _ in late)
+        whole = np.array(products) / (np.sqrt(square * power) or 1.0)
+        # A mean of two comes half a sample later.
+        both = 0.5 * (np.array(products[1:]) + products[:-1])
+        both /= np.sqrt(max(0.25 * (2 * square + next_to), 0.0) * power) or 1.0
+        best = max(best, *whole, *both)
+        for alike, half in ((whole, 1), (both, 2)):
+            if alike.min(initial=0.0) < worst:
+                worst, reverse = float(alike.min()), [(_means(x, half), y) for x, y in late]
+    if -worst <= SIGN_LEAST.value:  # then nobody asks what chance would make of it
+        return Likeness(best, -worst, np.inf)
+    sizes = [float(np.sqrt((x @ x) * (y @ y))) for x, y in reverse]
+    spread = [size * _chance(x, y) for size, (x, y) in zip(sizes, reverse, strict=True)]
+    chance = float(np.linalg.norm(spread)) / (sum(sizes) or 1.0)
+    return Likeness(best, -worst, chance)
+
+
+def _smooth(record: Record, signal: Array) -> tuple[float, Array, Array] | None:
+    """Return sampling interval, voltage and signal, both as means over runs that it outlives."""
+    known = np.isfinite(signal)
+    if known.sum() < 20:
+        return None
+    step = record.sample_time
+    y, there = np.where(known, signal, 0.0), known.astype(np.float64)
+    k, volts = max(1, len(record) // RUNS), record.voltage
+    while k > 1 and 2 * np.square(_means(volts, k)).sum() < np.square(volts).sum():
+        k //= 2
+    return step, _means(volts, k), _means(y, k) / np.maximum(_means(there, k), 1e-9 + 0.5 / k)
+
+
+def _every(values: Array, k: int) -> Array:
+    """Return the means of k neighbours, one of each k."""
+    n = values.size // k * k
+    return np.asarray(values[:n].reshape(-1, k) @ np.full(k, 1 / k)) if 1 < k <= n else values
+
+
+def _means(values: Array, k: int) -> Array:
+    """Return the means of k neighbours, in the places of their last."""
+    if k <= 1:
+        return values
+    sums = np.cumsum(values)
+    sums[k:] -= sums[:-k].copy()
+    return sums / k
+
+
+def _chance(v: Array, y: Array) -> float:
+    """Return the standard deviation of the correlation of two signals that have no part in
+    each other (Bartlett): the sum of the product of their autocorrelations over n.
+    """
+    size = next_fast_len(2 * len(v), real=True)
+    own = [irfft(np.abs(rfft(x, size)) ** 2, size)[: len(v)] for x in (v, y)]
+    if own[0][0] == 0 or own[1][0] == 0:
+        return 1.0
+    product = (own[0] / own[0][0]) * (own[1] / own[1][0])
+    return float(np.sqrt(max(1.0, 2 * product.sum() - 1) / len(v)))
+
+
+def lost_sign(records: Sequence[Record], speeds: Sequence[Array], where: str) -> None:
+    """Refuse signals whose sign was lost."""
+    lowest = min(float(np.nanmin(r.voltage)) for r in records)
+    ways = np.concatenate([_ways(r, w) for r, w in zip(records, speeds, strict=True)])
+    way, back = float(np.abs(ways).sum()), -float(np.minimum(ways, 0.0).sum())
+    if lowest >= 0 and back > BACKWARD.value * way and way - back > BACKWARD.value * way:
+        raise SignalError(
+            f"{where}: the voltage is never negative, though {back / way:.0%} of the way is "
+            "backwards: it has no sign; map its direction with direction=COLUMN, or record a "
+            "signed command"
+        )
+    if all(_size_of(r) for r in records):
+        raise SignalError(
+            f"{where}: velocity is never negative although the voltage is, and follows its size: "
+            "it has no sign; record a signed speed, the encoder's counts or a direction"
+        )
+
+
+def _ways(record: Record, speed: Array) -> Array:
+    """Return the ways of runs of samples; none where its sensor's noise makes one as long."""
+    starts = np.unique(np.linspace(0, speed.size, WAYS, endpoint=False).astype(int))
+    speed = np.nan_to_num(speed)
+    ways = np.add.reduceat(speed, starts)
+    squares = np.add.reduceat(np.square(np.diff(speed, prepend=speed[:1])), starts)
+    # The errors of all speeds add up, of the differences of angles those at the two ends.
+    share = 1 / np.diff(starts, append=speed.size) if record.velocity is None else 0.5
+    return np.where(np.abs(ways) > SIGN_SURE.value * np.sqrt(squares * share), ways, 0.0)
+
+
+def _size_of(record: Record) -> bool:
+    """Tell whether a speed is the magnitude of the motor's response to its voltage."""
+    speed, volts = record.velocity, record.voltage
+    if speed is None or record.count is not None or record.position is not None:
+        return False
+    if np.nanmin(speed) < 0 or not volts.min() < 0 < volts.max():
+        return False
+    known = np.isfinite(speed)
+    found = []
+    for lag in np.geomspace(1.0, max(len(record) / 10, 2.0), ANSWERS):
+        made = lagged(volts, float(lag))[known]
+        found.append([_share(x, speed[known]) for x in (made, np.abs(made))])
+    signed, size = np.max(found, axis=0)
+    return bool(size > HALF_EXPLAINED.value and signed < HALF_EXPLAINED.value * size)
+
+
+def _share(x: Array, y: Array) -> float:
+    """Return the share of a variance explained by a line."""
+    x, y = x - x.mean(), y - y.mean()
+    both = float((x @ x) * (y @ y))
+    return float(x @ y) ** 2 / both if both > 0 else 0.0

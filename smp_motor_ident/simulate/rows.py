@@ -1,0 +1,159 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Rows of records as the simulation takes them: instants, segments and pieces of constant input."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import numpy as np
+
+from smp_motor_control.arrays import Array, Integers
+
+MOST_KEPT = 4  # ways of cutting that are kept
+MOST_GROUPS = 48  # lengths of pieces whose transitions are tabulated
+SAME = 1e-9  # relative difference of two lengths that are one
+
+
+@dataclass(frozen=True, eq=False)
+class Pieces:
+    """Intervals of constant input, row by row; see `simulate.kernel.run`."""
+
+    first: Integers  # shape (n + 1,)
+    length: Array
+    edges: Integers
+    group: Integers
+    section: Integers
+    grouped: Array  # shape (groups,): length of each group [s]
+    grouped_edges: Integers
+
+
+@dataclass(frozen=True, eq=False)
+class Rows:
+    """Instants of records, one after the other, and the command between them.
+
+    A section is an interval of constant command; it acts until the next one of its segment begins.
+    """
+
+    time: Array  # shape (n,), [s]: increasing within a segment
+    segment: Integers  # shape (g + 1,): first row of every segment, and n
+    begin: Array  # shape (s,), [s]: when each section begins; ignored of the first of a segment
+    command: Array  # shape (s,), [V]
+    section: Integers  # shape (g + 1,): first section of every segment, and s
+    _kept: dict[tuple[float, float, bool], Pieces] = field(default_factory=dict)
+
+    @classmethod
+    def held(cls, time: Array, voltage: Array, segment: Integers) -> Rows:
+        """Return rows whose voltage was held over the interval that ends at each of them."""
+        return cls(time, segment, np.concatenate([[0.0], time[:-1]]), voltage, segment)
+
+    def __len__(self) -> int:
+        """Return the number of rows."""
+        return int(self.time.size)
+
+    @cached_property
+    def plain(self) -> bool:
+        """Whether every row is one section."""
+        same = self.begin.size == self.time.size and np.array_equal(self.section, self.segment)
+        return bool(same and np.array_equal(self.begin[1:], self.time[:-1]))
+
+    @cached_property
+    def interval(self) -> Array:
+        """Interval that ends at each row [s]; 0 at the first of a segment."""
+        gone = np.diff(self.time, prepend=self.time[0])
+        gone[self.segment[:-1]] = 0.0
+        return gone
+
+    @cached_property
+    def step(self) -> float:
+        """Median interval between rows [s]."""
+        return float(np.median(self.interval[self.interval > 0]))
+
+    @cached_property
+    def age(self) -> Array:
+        """Share of all time that has passed at every row, from 0 to 1."""
+        gone = np.cumsum(self.interval)
+        return gone / (gone[-1] or 1.0)
+
+    def pieces(self, delay: float, longest: float = np.inf, moving: bool = False) -> Pieces:
+        """Cut the rows where a command that acts ``delay`` [s] late switches.
+
+        ``longest``: length [s] of a piece at most.  ``moving``: whether delays differ by lane.
+        """
+        key = delay, longest, moving
+        if key not in self._kept:
+            if len(self._kept) >= MOST_KEPT:
+                self._kept.pop(next(iter(self._kept)))
+            self._kept[key] = self._pieces(delay, longest, moving)
+        return self._kept[key]
+
+    def _pieces(self, delay: float, longest: float, moving: bool) -> Pieces:
+        n = len(self)
+        cut = not self.plain or delay != 0.0 or moving
+        section, length, edges, count = self._cut(delay) if cut else self._uncut()
+        if np.isfinite(longest):
+            parts = np.maximum(np.ceil(length / longest - SAME), 1).astype(np.int64)
+            if parts.max() > 1:
+                row = np.repeat(np.repeat(np.arange(n), count), parts)
+                # The shift of a lane belongs to the part next to the switch.
+                end = np.cumsum(parts)
+                whole, edges = edges, np.zeros(row.size, dtype=np.int64)
+                edges[np.where(whole > 0, end - 1, end - parts)] = whole
+                section, length = np.repeat(section, parts), np.repeat(length / parts, parts)
+                count = np.bincount(row, minlength=n)
+        first = np.concatenate([[0], np.cumsum(count)])
+        group, grouped, grouped_edges = _groups(length, edges, self.step)
+        return Pieces(first, length, edges, group, section, grouped, grouped_edges)
+
+    def _uncut(self) -> tuple[Integers, Array, Integers, Integers]:
+        """Return what `_cut` does where every row is one section."""
+        n = len(self)
+        return np.arange(n), self.interval, np.zeros(n, np.int64), np.ones(n, np.int64)
+
+    def _cut(self, delay: float) -> tuple[Integers, Array, Integers, Integers]:
+        """Return section, length and edges of every piece, and the pieces of every row."""
+        n, seg = len(self), self.segment
+        # One axis for all segments: each begins beyond the one before by more than any delay.
+        gap: Array = np.zeros(seg.size - 1)
+        gap[1:] = self.time[seg[1:-1] - 1] - self.time[seg[1:-1]] + 4 * abs(delay) + 1.0
+        gap = np.cumsum(gap)
+        axis = self.time + np.repeat(gap, np.diff(seg))
+        switch = np.delete(np.arange(self.begin.size), self.section[:-1])
+        instant = (self.begin + np.repeat(gap, np.diff(self.section)))[switch] + delay
+        begin = axis - self.interval
+        # Switches before each row's interval, and within [begin, row).
+        at = np.searchsorted(instant, begin, side="left")
+        until = np.searchsorted(instant, axis, side="left")
+        known = self.section[:-1] - np.arange(seg.size - 1)  # switches of earlier segments
+        known = np.repeat(known, np.diff(seg))
+        at, until = np.maximum(at, known), np.maximum(until, known)
+        until[seg[:-1]] = at[seg[:-1]]
+        inside = until - at
+        count = inside + 1
+        row = np.repeat(np.arange(n), count)
+        nth = np.arange(row.size) - np.repeat(np.cumsum(count) - count, count)
+        which = at[row] + nth  # switch at which the piece ends, unless it is the row's last
+        last = nth == inside[row]
+        at_switch = instant[np.minimum(which, instant.size - 1)] if instant.size else axis[row]
+        ends = np.where(last, axis[row], at_switch)
+        begins = np.where(nth == 0, begin[row], np.concatenate([[0.0], ends[:-1]]))
+        first = np.repeat(self.section[:-1], np.diff(seg))[row]
+        before = switch[np.maximum(which - 1, 0)] if switch.size else first
+        section = np.where(which > known[row], before, first)
+        edges = np.where(last, 0, 1) - np.where(nth == 0, 0, 1)
+        return section, np.maximum(ends - begins, 0.0), edges.astype(np.int64), count
+
+
+def _groups(length: Array, edges: Integers, step: float) -> tuple[Integers, Array, Integers]:
+    """Return the group of every piece and the length and edges of each; none where all differ."""
+    low, high = float(length.min()), float(length.max())
+    if high - low <= SAME * step and not edges.any():
+        return np.zeros(length.size, dtype=np.int64), np.array([length[0]]), np.zeros(1, np.int64)
+    sample = np.round(length[:: max(length.size // 2000, 1)] / (SAME * 10 * step))
+    if np.unique(sample).size > MOST_GROUPS:
+        return np.full(length.size, -1), np.zeros(0), np.zeros(0, dtype=np.int64)
+    key = np.round(length / (SAME * 10 * step)).astype(np.int64) * 4 + edges + 1
+    kinds, index, group = np.unique(key, return_index=True, return_inverse=True)
+    if kinds.size > MOST_GROUPS:
+        return np.full(length.size, -1), np.zeros(0), np.zeros(0, dtype=np.int64)
+    return group.astype(np.int64), length[index], edges[index]
