@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Starts a robot: simulated motors or real ones, a controller for each wheel, skid_steer.
 
     ros2 launch smp_motor_control smp.launch.py                                   # simulated
@@ -23,7 +24,7 @@ from launch_ros.substitutions import FindPackageShare
 from launch import LaunchDescription
 from smp_motor_control import LEFT, RIGHT, check_wheel_names
 from smp_motor_control.body.description import robot_description
-from smp_motor_control.parameter_file import parameters_of, require_nodes
+from smp_motor_control.parameter_file import read_node_parameters, require_nodes
 
 PACKAGE = "smp_motor_control"
 STATE_PUBLISHER = "share/robot_state_publisher"
@@ -49,11 +50,11 @@ ARGUMENTS = {
 
 
 def start(context, *_) -> list:
-    """Return the nodes; what is wrong with the arguments stops the launch."""
+    """Return the nodes; invalid arguments stop the launch."""
     given = {name: LaunchConfiguration(name).perform(context) for name in ARGUMENTS}
     if given["hardware"] not in ("simulated", "external"):
         raise RuntimeError(f"hardware is {given['hardware']!r}; it must be simulated or external")
-    geometry = parameters_of(given["body"], "skid_steer")
+    geometry = read_node_parameters(given["body"], "skid_steer")
     sides = [
         [name.strip() for name in given[f"{side}_wheels"].split(",") if name.strip()]
         or list(geometry.get(f"{side}_wheel_names", usual))

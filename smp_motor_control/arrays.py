@@ -1,4 +1,5 @@
-"""Types of arrays that both packages share."""
+# SPDX-License-Identifier: Apache-2.0
+"""Array types of both packages."""
 
 import numpy as np
 from numpy.typing import NDArray

@@ -1,4 +1,5 @@
-"""Incremental encoders: counts from an angle, rollover, and speed from counts."""
+# SPDX-License-Identifier: Apache-2.0
+"""Incremental encoders: counts of an angle, rollover, and speed from counts."""
 
 import math
 from collections import deque
@@ -23,9 +24,8 @@ class Encoder:
     -126
     """
 
-    # Counts (after quadrature decoding) per revolution of the motor, positive
-    counts_per_revolution: float = 500.0
-    bits: int = 0  # width of the hardware's counter, read as two's complement; 0 never wraps
+    counts_per_revolution: float = 500.0  # of the motor, after quadrature decoding
+    bits: int = 0  # width of the two's complement counter; 0 never wraps
 
     def __post_init__(self) -> None:
         check_range("counts_per_revolution", self.counts_per_revolution, 1e-3, 1e9)
@@ -37,7 +37,7 @@ class Encoder:
         return 2 * math.pi / self.counts_per_revolution
 
     def count(self, angle: float) -> int:
-        """Return what the counter shows at a motor angle."""
+        """Return the counter's value at a motor angle."""
         return wrap(math.floor(angle * self.counts_per_revolution / (2 * math.pi)), self.bits)
 
 
@@ -47,7 +47,7 @@ def _check_bits(bits: int) -> None:
 
 
 def wrap(count: int, bits: int) -> int:
-    """Return a count as a two's complement counter of this width shows it."""
+    """Return a count wrapped to a two's complement counter of this width."""
     if bits == 0:
         return count
     half = 1 << (bits - 1)
@@ -55,7 +55,7 @@ def wrap(count: int, bits: int) -> int:
 
 
 def unwrap(counts: ArrayLike, bits: int) -> Integers:
-    """Return total counts from what a wrapping counter showed."""
+    """Return total counts from the values of a wrapping counter."""
     _check_bits(bits)
     shown = np.asarray(counts, dtype=np.int64)
     if bits == 0 or shown.size == 0:
@@ -67,7 +67,7 @@ def unwrap(counts: ArrayLike, bits: int) -> Integers:
 
 
 class Unwrapper:
-    """The same as :func:`unwrap`, one count at a time."""
+    """Unwrap counts like :func:`unwrap`, one at a time."""
 
     def __init__(self, bits: int) -> None:
         _check_bits(bits)
@@ -76,11 +76,11 @@ class Unwrapper:
         self._total = 0
 
     def reset(self) -> None:
-        """Forget the counter, as after a restart of the hardware."""
+        """Discard the last count, as after a restart of the hardware."""
         self._shown = None
 
     def __call__(self, count: int) -> int:
-        """Return the total counts after the counter showed ``count``."""
+        """Return the total counts after a reading."""
         if self._shown is None:
             self._total = count
         else:
@@ -89,15 +89,15 @@ class Unwrapper:
         return self._total
 
 
-WIDTHS = (8, 16, 24, 32)
-"""Bits that hardware counters have."""
+COUNTER_WIDTHS = (8, 16, 24, 32)
+"""Common widths of hardware counters [bits]."""
 
 
 class CounterWidth:
-    """Tells the width of a counter that wraps where nobody said so.
+    """Detect the width of a counter that wraps unexpectedly.
 
-    A step as large as a counter of some width has steps back is a wrap where the way that it leaves
-    is like that of the sample before.
+    A large step is a wrap when removing a full range of some width leaves a step similar to the
+    previous one.
 
     Examples
     --------
@@ -111,13 +111,13 @@ class CounterWidth:
         self._moved: int | None = None
 
     def step(self, count: int) -> int:
-        """Return the width of a counter that has just wrapped; 0 where it has not."""
+        """Return the width [bits] of a counter that has just wrapped; 0 otherwise."""
         before, self._count = self._count, count
         moved = 0 if before is None else count - before
         usual, self._moved = self._moved, moved
-        if usual is None or abs(moved) < 1 << (WIDTHS[0] - 1):
+        if usual is None or abs(moved) < 1 << (COUNTER_WIDTHS[0] - 1):
             return 0
-        for bits in WIDTHS:
+        for bits in COUNTER_WIDTHS:
             left = wrap(moved, bits)
             alike = abs(left - usual) <= max(abs(usual), 8)
             if alike and abs(moved) > 4 * abs(usual) and abs(moved - left) == 1 << bits:
@@ -127,7 +127,7 @@ class CounterWidth:
 
 
 class DifferencedSpeed:
-    """Motor speed [rad/s] as counts moved over a window of samples; one is noisiest and fastest."""
+    """Motor speed [rad/s] by differencing counts over a window of samples."""
 
     def __init__(self, encoder: Encoder, window: int = 1) -> None:
         if window < 1:
@@ -138,12 +138,12 @@ class DifferencedSpeed:
         self.total = 0  # unwrapped counts at the last sample
 
     def reset(self) -> None:
-        """Forget the past, as after lost feedback."""
+        """Discard past samples, as after lost feedback."""
         self._unwrap.reset()
         self._past.clear()
 
     def step(self, time: float, count: int) -> float:
-        """Take one sample."""
+        """Return the speed after one more sample; NaN before the second."""
         self.total = total = self._unwrap(count)
         past = self._past
         past.append((time, total))

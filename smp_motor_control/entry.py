@@ -1,4 +1,5 @@
-"""The executables: each imports its program while it already listens to Ctrl-C."""
+# SPDX-License-Identifier: Apache-2.0
+"""Entry points; each handles Ctrl-C from before its imports."""
 
 import importlib.util
 import os
@@ -7,62 +8,63 @@ import sys
 from collections.abc import Callable
 from types import FrameType
 
-# One thread for linear algebra: our matrices are small, and the library waits for a second
-# thread in a busy loop, which under SCHED_FIFO may never end.
+# One thread for linear algebra: with two, OpenBLAS waits in a busy loop, which under SCHED_FIFO
+# may never end.
 for _library in ("OPENBLAS", "MKL", "OMP"):
     os.environ.setdefault(f"{_library}_NUM_THREADS", "1")
 
 
-_PIP = {"yaml": "pyyaml", "numba": "numba==0.61.2"}
-"""What pip calls a module otherwise."""
+_PIP_NAMES = {"yaml": "pyyaml", "numba": "numba==0.61.2"}
+"""Distribution names that differ from the module's."""
 
-_ROS = ("ament_index_python", "builtin_interfaces", "rcl_interfaces", "rpyutils")
+_ROS_MODULES = ("ament_index_python", "builtin_interfaces", "rcl_interfaces", "rpyutils")
 
-_OF_TOOLS = ("numpy", "scipy", "numba", "yaml", "rosbags", "msgspec", "rich")
-"""What a tool imports, some of it only while it works: looked for before it begins."""
+_TOOL_MODULES = ("numpy", "scipy", "numba", "yaml", "rosbags", "msgspec", "rich")
+"""Modules that a tool needs, checked before it starts because some are imported late."""
 
-MOST_DOMAIN = 232
-"""DDSI-RTPS 2.5, section 9.6.1.1: the ports of a higher domain lie beyond 65535."""
+MAX_DOMAIN_ID = 232
+"""Highest domain whose ports stay below 65536 (DDSI-RTPS 2.5, section 9.6.1.1)."""
 
 
-def _program(module: str, interrupted: int) -> Callable[[], int]:
-    """Return what runs ``main`` of a module, and its exit code where Ctrl-C came before that."""
+def _make_program(module: str, interrupt_code: int) -> Callable[[], int]:
+    """Return a function that runs a module's ``main``; an early Ctrl-C gives ``interrupt_code``."""
 
     def run() -> int:
         try:
             return importlib.import_module(module).main() or 0
         except KeyboardInterrupt:
-            return interrupted
+            return interrupt_code
         except ImportError as error:
-            if was_interrupted(error):
-                return interrupted
+            if is_interrupt(error):
+                return interrupt_code
             if os.environ.get("SMP_DEBUG") or not isinstance(error, ModuleNotFoundError):
                 raise
-            print(f"{module.rpartition('.')[2]}: {missing(error)}", file=sys.stderr)
+            print(f"{module.rpartition('.')[2]}: {explain_missing_module(error)}", file=sys.stderr)
             return 2
 
     return run
 
 
-def was_interrupted(error: BaseException | None) -> bool:
-    """Whether an import failed because Ctrl-C came while a compiled module was made ready."""
+def is_interrupt(error: BaseException | None) -> bool:
+    """Return whether Ctrl-C caused an error, as in the import of a compiled module."""
     while error is not None and not isinstance(error, KeyboardInterrupt):
         error = error.__cause__ or error.__context__
     return error is not None
 
 
-def missing(error: ModuleNotFoundError) -> str:
-    """Return what to do about a module that is not installed, in one line."""
+def explain_missing_module(error: ModuleNotFoundError) -> str:
+    """Return a one-line remedy for a missing module."""
     name = (error.name or "").partition(".")[0]
     if name == "smp_interfaces":
-        return "smp_interfaces is not built or not sourced; build both packages of the repository"
-    if name in ("rclpy", "launch", *_ROS) or name.endswith("_msgs"):
-        return f"{name} is not there; source ROS 2 Jazzy and the workspace, or setup.bash"
-    return f"the Python package {name} is not installed; type: {_pip()} {_PIP.get(name, name)}"
+        return "smp_interfaces is not found; build both packages of the repository and source them"
+    if name in ("rclpy", "launch", *_ROS_MODULES) or name.endswith("_msgs"):
+        return f"{name} is not found; source ROS 2 Jazzy and the workspace, or setup.bash"
+    package = _PIP_NAMES.get(name, name)
+    return f"the Python package {name} is not installed; type: {_pip_command()} {package}"
 
 
-def _pip() -> str:
-    """Return the command that installs: Ubuntu's Python refuses pip without an option (PEP 668)."""
+def _pip_command() -> str:
+    """Return pip's install command, with the option that an externally managed Python needs."""
     import sysconfig
 
     marker = os.path.join(sysconfig.get_path("stdlib"), "EXTERNALLY-MANAGED")
@@ -71,17 +73,17 @@ def _pip() -> str:
 
 
 def node(name: str, package: str = "smp_motor_control") -> Callable[[], int]:
-    """Return what runs the node of that name until a signal, and returns the exit code."""
-    program = _program(f"{package}.nodes.{name}", 0)
+    """Return a function that runs a node until a signal and returns the exit code."""
+    program = _make_program(f"{package}.nodes.{name}", 0)
 
     def run() -> int:
-        if wrong := wrong_domain():
+        if wrong := find_domain_problem():
             print(f"{name}: {wrong}", file=sys.stderr)
             return 2
-        # Those of bags have arguments of their own, and their own help.
+        # record and play parse their own arguments and print their own help.
         if name not in ("record", "play") and {"-h", "--help"} & set(sys.argv[1:]):
             sys.argv[1:] = [f"{package}.nodes.{name}"]
-            return _program("smp_motor_control.nodes.usage", 0)()
+            return _make_program("smp_motor_control.nodes.usage", 0)()
         if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
             signal.signal(signal.SIGINT, _interrupt)
         return program()
@@ -97,26 +99,29 @@ def _interrupt(number: int, frame: FrameType | None) -> None:
     raise KeyboardInterrupt
 
 
-def interrupted() -> bool:
-    """Tell whether Ctrl-C came while a node was imported: Python drops it in some callbacks."""
+def was_interrupted_on_import() -> bool:
+    """Return whether Ctrl-C came during the import of a node; some callbacks swallow it."""
     return bool(_interrupts)
 
 
-def wrong_domain() -> str:
-    """Return what is wrong with ROS_DOMAIN_ID, of which DDS itself says nothing; else nothing."""
+def find_domain_problem() -> str:
+    """Return an error for an invalid ROS_DOMAIN_ID, which DDS ignores silently; else nothing."""
     domain = os.environ.get("ROS_DOMAIN_ID", "").strip() or "0"
-    if domain.isdecimal() and int(domain) <= MOST_DOMAIN:
+    if domain.isdecimal() and int(domain) <= MAX_DOMAIN_ID:
         return ""
-    return f"ROS_DOMAIN_ID is {domain!r}; it must be a whole number from 0 to {MOST_DOMAIN}"
+    return f"ROS_DOMAIN_ID is {domain!r}; it must be a whole number from 0 to {MAX_DOMAIN_ID}"
 
 
-def _tool(name: str, *more: str) -> Callable[[], int]:
-    program = _program(f"smp_motor_ident.cli.{name}", 130)
+def _make_tool(name: str, *more: str) -> Callable[[], int]:
+    program = _make_program(f"smp_motor_ident.cli.{name}", 130)
 
     def run() -> int:
-        for module in (*_OF_TOOLS, *more):
+        for module in (*_TOOL_MODULES, *more):
             if importlib.util.find_spec(module) is None:
-                print(f"{name}: {missing(ModuleNotFoundError(name=module))}", file=sys.stderr)
+                print(
+                    f"{name}: {explain_missing_module(ModuleNotFoundError(name=module))}",
+                    file=sys.stderr,
+                )
                 return 2
         return program()
 
@@ -132,7 +137,7 @@ serial_driver = node("serial_driver")
 record = node("record", "smp_motor_ident")
 play = node("play", "smp_motor_ident")
 identifier = node("identifier", "smp_motor_ident")
-identify = _tool("identify")
-tune = _tool("tune")
-commission = _tool("commission", "mcap")
-demo = _tool("demo", "mcap")
+identify = _make_tool("identify")
+tune = _make_tool("tune")
+commission = _make_tool("commission", "mcap")
+demo = _make_tool("demo", "mcap")

@@ -1,13 +1,11 @@
-"""The errors that a caller can do something about.
-
-Every message names the value (and the file where there is one) and says what to do.
-"""
+# SPDX-License-Identifier: Apache-2.0
+"""Errors with a one-line message that names the value, the file and the remedy."""
 
 import math
 import re
 
-LONGEST_MESSAGE = 1000
-"""Characters of a message: of a value that is quoted from a spoilt file head and tail are shown."""
+MAX_MESSAGE_LENGTH = 1000
+"""Longer messages, such as those that quote a damaged file, are shortened in the middle."""
 
 
 _TOKEN = "[A-Za-z_][A-Za-z0-9_]*"
@@ -15,32 +13,32 @@ _NAME = re.compile(f"{_TOKEN}(/{_TOKEN})*")
 
 
 def printable(text: str) -> str:
-    """Return a text in one line: whatever else a file or a path holds is replaced."""
+    """Return a text with its non-printable characters replaced."""
     return "".join(c if c.isprintable() else "\N{REPLACEMENT CHARACTER}" for c in text)
 
 
 def is_ros_name(name: str) -> bool:
-    """Return whether a name may stand in those of topics and nodes, in exports and in paths."""
+    """Return whether a name is valid in topics, node names, exports and paths."""
     return _NAME.fullmatch(name) is not None
 
 
 class SmpError(Exception):
-    """Base of all errors of this project; its text is one line for the user."""
+    """Base of all errors of this project."""
 
     exit_code = 2
 
     def __str__(self) -> str:
-        """Return the message in one line, without its middle where nobody would read that."""
-        text, half = printable(super().__str__()), LONGEST_MESSAGE // 2
-        return text if len(text) <= LONGEST_MESSAGE else f"{text[:half]} … {text[-half:]}"
+        """Return the message in one line, shortened to :data:`MAX_MESSAGE_LENGTH`."""
+        text, half = printable(super().__str__()), MAX_MESSAGE_LENGTH // 2
+        return text if len(text) <= MAX_MESSAGE_LENGTH else f"{text[:half]} … {text[-half:]}"
 
 
 class ParameterError(SmpError, ValueError):
-    """A parameter has a value that no motor, controller or robot can have."""
+    """A parameter has an impossible value."""
 
 
 def check_range(name: str, value: float, low: float, high: float, unit: str = "") -> float:
-    """Return a number that lies between two limits, of which the message names both."""
+    """Return a number; raise when it is not between two limits."""
     number = not isinstance(value, (bool, str)) and hasattr(value, "__float__")
     if number and low <= float(value) <= high:
         return float(value)
@@ -49,7 +47,7 @@ def check_range(name: str, value: float, low: float, high: float, unit: str = ""
 
 
 def check_positive(name: str, value: float, unit: str = "", *, or_zero: bool = False) -> None:
-    """Refuse what is not finite and positive; zero only where it is none of what may be."""
+    """Raise unless a number is finite and positive (or zero, if allowed)."""
     if not (0.0 < value < math.inf or (or_zero and value == 0.0)):
         given = f"{value!r} {unit}".rstrip()
         raise ParameterError(f"{name} is {given}; it must be {'zero or ' * or_zero}positive")

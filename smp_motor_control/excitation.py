@@ -1,8 +1,8 @@
-"""Voltages that make a motor tell about itself, as functions of time.
+# SPDX-License-Identifier: Apache-2.0
+"""Excitation voltages for identification, as functions of time.
 
-Every signal is bounded by its amplitude, and none repeats in step with the sampling: a
-nominal frequency is detuned by ``sqrt(1.05)``, which no sampling rate is a multiple of.
-Quantisation errors that repeat are a bias; those that do not are noise.
+Every signal is bounded by its amplitude.  Nominal frequencies are multiplied by ``sqrt(1.05)`` so
+that no signal is periodic in the sampling: periodic quantisation errors would bias the estimate.
 """
 
 import math
@@ -17,15 +17,15 @@ from smp_motor_control.arrays import Array
 from smp_motor_control.errors import ParameterError, check_positive
 
 DETUNING = math.sqrt(1.05)
-"""Irrational factor between a nominal frequency and the one that is sent."""
+"""Irrational ratio of the actual to the nominal frequency."""
 
-_CREST = 2.2
-_GOLDEN = (math.sqrt(5.0) - 1.0) / 2.0
+_MAX_CREST_FACTOR = 2.2
+_GOLDEN_RATIO = (math.sqrt(5.0) - 1.0) / 2.0
 
 
 @dataclass(frozen=True, kw_only=True)
 class Excitation(ABC):
-    """Base of all signals: bounded by ``amplitude`` and zero before time zero."""
+    """Signal that is bounded by ``amplitude`` and zero before time zero."""
 
     amplitude: float  # largest absolute value [V], positive
 
@@ -39,7 +39,7 @@ class Excitation(ABC):
     @overload
     def __call__(self, time: Array) -> Array: ...
     def __call__(self, time: float | Array) -> float | Array:
-        """Return the signal at one or many instants."""
+        """Return the signal [V] at one or many instants [s]."""
         times = np.atleast_1d(np.asarray(time, dtype=np.float64))
         begun = times >= 0
         shape = self._shape(np.where(begun, times, 0.0))
@@ -49,12 +49,12 @@ class Excitation(ABC):
 
     @abstractmethod
     def _shape(self, time: Array) -> Array:
-        """Return the signal of amplitude 1 at instants from time zero on."""
+        """Return the signal of amplitude 1 at non-negative instants."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Sine(Excitation):
-    """A sine of a nominal ``frequency`` [Hz]."""
+    """Sine of a nominal ``frequency`` [Hz]."""
 
     frequency: float = 1.0
 
@@ -64,7 +64,7 @@ class Sine(Excitation):
 
 @dataclass(frozen=True, kw_only=True)
 class Square(Excitation):
-    """Full voltage either way, of a nominal ``frequency`` [Hz]."""
+    """Square wave of a nominal ``frequency`` [Hz]."""
 
     frequency: float = 1.0
 
@@ -74,7 +74,7 @@ class Square(Excitation):
 
 @dataclass(frozen=True, kw_only=True)
 class Band(Excitation):
-    """Base of signals of a range of frequencies, from ``lowest`` to ``highest`` [Hz]."""
+    """Signal with frequencies from ``lowest`` to ``highest`` [Hz]."""
 
     lowest: float = 0.1
     highest: float = 20.0
@@ -89,10 +89,10 @@ class Band(Excitation):
 
 @dataclass(frozen=True, kw_only=True)
 class Fourier(Band):
-    """A sum of incommensurate tones on a logarithmic scale, its rare peaks clipped."""
+    """Multisine of incommensurate, logarithmically spaced tones; rare peaks are clipped."""
 
-    tones: int = 24  # their number
-    seed: int = 0  # of the phases; different seeds give signals that hardly correlate
+    tones: int = 24
+    seed: int = 0  # signals of different seeds are nearly uncorrelated
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -112,9 +112,9 @@ class Fourier(Band):
 
 
 def _frequencies(lowest: float, highest: float, tones: int, seed: int) -> Array:
-    # Golden-ratio dither of the places: ratios of tones are irrational, and differ by seed.
+    # Golden-ratio dither makes the ratios of tones irrational and different for each seed.
     k = np.arange(tones)
-    dither = ((k + 1 + 7 * seed) * _GOLDEN) % 1.0 - 0.5
+    dither = ((k + 1 + 7 * seed) * _GOLDEN_RATIO) % 1.0 - 0.5
     place = np.clip((k + 0.4 * dither) / (tones - 1), 0.0, 1.0)
     frequencies: Array = lowest * (highest / lowest) ** place
     frequencies[0] *= 1 + 1e-3 * (1 + dither[0])
@@ -124,12 +124,11 @@ def _frequencies(lowest: float, highest: float, tones: int, seed: int) -> Array:
 
 @lru_cache(maxsize=32)
 def _multisine(lowest: float, highest: float, tones: int, seed: int) -> tuple[Array, Array, float]:
-    """Return frequencies, phases and full scale of the draw whose peak is the lowest.
+    """Return frequencies, phases and full scale of the random draw with the lowest peak.
 
-    Incommensurate tones have no period over which phases could be optimised, so the best of
-    some random draws over a long stretch is taken.  Even that peaks at three times its rms
-    value; clipping at 2.2 times, which concerns some percent of the time, buys 1.4 times the
-    voltage.  The motor does not mind: what is sent is what is recorded.
+    Incommensurate tones have no period over which to optimise phases.  The best draw still peaks at
+    three times its rms value; clipping at 2.2 times affects a few per cent of the time and raises
+    the rms voltage by a factor of 1.4.
     """
     frequencies = _frequencies(lowest, highest, tones, seed)
     rng = np.random.default_rng([seed, tones])
@@ -140,12 +139,16 @@ def _multisine(lowest: float, highest: float, tones: int, seed: int) -> tuple[Ar
     draws = rng.uniform(0.0, 2 * math.pi, (64, tones))
     peaks = np.abs(sine @ np.cos(draws).T + cosine @ np.sin(draws).T).max(axis=0)
     best = int(np.argmin(peaks))
-    return frequencies, draws[best], min(float(peaks[best]), _CREST * math.sqrt(tones / 2))
+    return (
+        frequencies,
+        draws[best],
+        min(float(peaks[best]), _MAX_CREST_FACTOR * math.sqrt(tones / 2)),
+    )
 
 
 @dataclass(frozen=True, kw_only=True)
 class Chirp(Band):
-    """A sine whose frequency rises exponentially and falls again, over and over."""
+    """Sine whose frequency rises and falls exponentially, periodically."""
 
     sweep: float = 20.0  # time from the lowest to the highest frequency [s]
 
@@ -163,10 +166,10 @@ class Chirp(Band):
 
 @dataclass(frozen=True, kw_only=True)
 class Steps(Excitation):
-    """Steps to random voltages of either sign, each held."""
+    """Steps to random voltages of either sign."""
 
     hold: float = 1.0  # nominal length of a step [s]
-    seed: int = 0  # of the sequence
+    seed: int = 0
 
     def _shape(self, time: Array) -> Array:
         index = (time * DETUNING / self.hold).astype(np.int64)
@@ -177,7 +180,7 @@ class Steps(Excitation):
 
 @dataclass(frozen=True, kw_only=True)
 class Prbs(Steps):
-    """Pseudo-random binary voltage: steps of full size."""
+    """Pseudo-random binary voltage of full amplitude."""
 
     hold: float = 0.05  # nominal shortest time between two changes of sign [s]
 
@@ -187,16 +190,16 @@ class Prbs(Steps):
 
 @lru_cache(maxsize=32)
 def _random_levels(seed: int) -> Array:
-    """Return a long random sequence in [-1, 1] that every use of the seed repeats."""
+    """Return a long random sequence in [-1, 1] that depends on the seed only."""
     levels: Array = np.random.default_rng(seed).uniform(-1.0, 1.0, 1 << 16)
     return levels
 
 
 @dataclass(frozen=True, kw_only=True)
 class Ramp(Excitation):
-    """A triangle through zero, slow enough to show where the motor starts and stops."""
+    """Slow triangle wave through zero, which shows break-away and standstill."""
 
-    period: float = 20.0  # nominal time [s] from zero over both peaks back to zero
+    period: float = 20.0  # nominal period [s]
 
     def _shape(self, time: Array) -> Array:
         phase = (time / (self.period * DETUNING) + 0.75) % 1.0
@@ -206,12 +209,12 @@ class Ramp(Excitation):
 
 @dataclass(frozen=True, kw_only=True)
 class Bounded(Excitation):
-    """Another signal, faded in and out and zero outside its time."""
+    """Another signal of limited duration, faded in and out."""
 
     amplitude: float = field(default=math.inf, init=False)
-    signal: Excitation  # what is sent
-    duration: float  # length [s]
-    fade: float = 0.0  # time over which it grows and shrinks [s]
+    signal: Excitation
+    duration: float  # [s]
+    fade: float = 0.0  # time of fading in, and of fading out [s]
 
     def __post_init__(self) -> None:
         check_positive("duration", self.duration, "s")
@@ -233,4 +236,4 @@ class Bounded(Excitation):
 SIGNALS: dict[str, type[Excitation]] = {
     kind.__name__.lower(): kind for kind in (Sine, Square, Fourier, Chirp, Prbs, Steps, Ramp)
 }
-"""The signals by the names that tools and the ``excite`` node use."""
+"""Signals by their names in tools and in the ``excite`` node."""

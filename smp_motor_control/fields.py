@@ -1,7 +1,8 @@
-"""Settings that say of every field what it is, to people and as parameters of nodes.
+# SPDX-License-Identifier: Apache-2.0
+"""Dataclass fields with descriptions and limits, from which nodes declare their parameters.
 
-Settings are frozen dataclasses, and may hold others; a parameter's name is its field's, or
-another, behind the prefixes of what it is in::
+Settings are frozen dataclasses and may be nested.  A parameter's name is that of its field (or
+``name``), after the prefixes of the settings that contain it::
 
     @dataclass(frozen=True, kw_only=True)
     class Settings:
@@ -20,7 +21,7 @@ S = TypeVar("S")
 
 
 class Described(NamedTuple):
-    """What is to be known of one parameter."""
+    """Description of one parameter."""
 
     default: Any
     text: str
@@ -28,15 +29,15 @@ class Described(NamedTuple):
     maximum: float = math.inf
     read_only: bool = False
     name: str = ""
-    endless: bool = False  # whether a parameter of 0 stands for infinity
+    endless: bool = False  # whether a parameter of 0 means infinity
 
     @property
     def limited(self) -> bool:
-        """Whether it is a number with a limit."""
+        """Whether the number has a limit."""
         return math.isfinite(self.minimum) or math.isfinite(self.maximum)
 
-    def with_zero(self) -> "Described":
-        """Return the parameter of what may be infinite."""
+    def with_zero_for_infinity(self) -> "Described":
+        """Return the description of a parameter in which 0 means infinity."""
         default = 0.0 if math.isinf(self.default) else self.default
         return self._replace(default=default, text=f"{self.text.rstrip('.')}; 0 for none.")
 
@@ -48,31 +49,31 @@ class _Nested(NamedTuple):
 
 
 def described(default: Any, description: str, **more: Any) -> Any:
-    """Return a field with a description, and what else is to be known of it."""
+    """Return a field with a description; ``more`` are attributes of :class:`Described`."""
     return dataclasses.field(
         default=default, metadata={"": Described(default, description, **more)}
     )
 
 
 def fixed(default: Any, description: str, **more: Any) -> Any:
-    """Return a field as :func:`described` does, of a parameter that only the start can set."""
+    """Return a field as :func:`described`, for a read-only parameter."""
     return described(default, description, read_only=True, **more)
 
 
 def nested(default: Any, *, prefix: str = "") -> Any:
-    """Return a field of settings in settings."""
+    """Return a field that holds other settings."""
     return dataclasses.field(default=default, metadata={"": _Nested(type(default), prefix)})
 
 
 def optional(kind: type, *needs: str, prefix: str) -> Any:
-    """Return a field of settings that are not there where what they need is 0, as it is first."""
+    """Return a field of settings that are None while the parameters ``needs`` are 0 (default)."""
     return dataclasses.field(default=None, metadata={"": _Nested(kind, prefix, needs)})
 
 
 def documented(settings: type[S]) -> type[S]:
-    """Add the descriptions of its fields to a class's docstring."""
+    """Append the descriptions of the fields to a class's docstring."""
     lines = [settings.__doc__ or "", "    Attributes", "    ----------"]
-    for field, known in _known(settings):
+    for field, known in _described_fields(settings):
         if isinstance(known, Described):
             lines += [f"    {field.name}", f"        {known.text}"]
     settings.__doc__ = "\n".join(lines)
@@ -80,14 +81,14 @@ def documented(settings: type[S]) -> type[S]:
 
 
 def parameters_in(settings: type, default: Any = None, prefix: str = "") -> dict[str, Described]:
-    """Return the parameters of settings by their names, with the defaults of one of them."""
+    """Return the parameters of settings by name; ``default`` is an instance with their defaults."""
     found = {}
-    for field, known in _known(settings):
+    for field, known in _described_fields(settings):
         value = field.default if default is None else getattr(default, field.name)
         if isinstance(known, Described):
             known = known._replace(default=value)
             found[prefix + (known.name or field.name)] = (
-                known.with_zero() if known.endless else known
+                known.with_zero_for_infinity() if known.endless else known
             )
             continue
         inside = prefix + known.prefix
@@ -97,9 +98,9 @@ def parameters_in(settings: type, default: Any = None, prefix: str = "") -> dict
 
 
 def settings_of(settings: type[S], values: Mapping[str, Any], prefix: str = "") -> S:
-    """Return settings from the values of their parameters; what is refused names its prefix."""
+    """Build settings from the values of their parameters; errors name the prefix."""
     given: dict[str, Any] = {}
-    for field, known in _known(settings):
+    for field, known in _described_fields(settings):
         if isinstance(known, Described):
             value = values[prefix + (known.name or field.name)]
             given[field.name] = value or math.inf if known.endless else value
@@ -108,20 +109,20 @@ def settings_of(settings: type[S], values: Mapping[str, Any], prefix: str = "") 
         there = [bool(values[inside + name]) for name in known.needs]
         if any(there) and not all(there):
             needed = " and ".join(inside + name for name in known.needs)
-            raise ParameterError(f"{needed} must be given together")
+            raise ParameterError(f"only one of {needed} is given; give both")
         if all(there):
-            given[field.name] = _inner(known, values, inside)
+            given[field.name] = _build_nested(known, values, inside)
     return settings(**given)
 
 
 def check_limits(settings: Any) -> None:
-    """Refuse a number beyond the limits that its description has."""
-    for field, known in _known(settings):
+    """Raise for a number beyond the limits of its description."""
+    for field, known in _described_fields(settings):
         if isinstance(known, Described) and known.limited:
             check_range(field.name, getattr(settings, field.name), known.minimum, known.maximum)
 
 
-def _inner(known: _Nested, values: Mapping[str, Any], prefix: str) -> Any:
+def _build_nested(known: _Nested, values: Mapping[str, Any], prefix: str) -> Any:
     try:
         return settings_of(known.kind, values, prefix)
     except ParameterError as error:
@@ -130,7 +131,7 @@ def _inner(known: _Nested, values: Mapping[str, Any], prefix: str) -> Any:
         raise ParameterError(f"{prefix.rstrip('.')}: {error}") from None
 
 
-def _known(settings: Any) -> Iterator[tuple[Any, Described | _Nested]]:
+def _described_fields(settings: Any) -> Iterator[tuple[Any, Described | _Nested]]:
     for field in dataclasses.fields(settings):
         if "" in field.metadata:
             yield field, field.metadata[""]

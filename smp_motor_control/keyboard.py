@@ -1,6 +1,7 @@
-"""Keys of a terminal to speeds of the body or of single wheels, with a dead man's switch.
+# SPDX-License-Identifier: Apache-2.0
+"""Keys of a terminal as speeds of the body or of single wheels, with a dead man's switch.
 
-A terminal tells that a key is held only by repeating it; a command ends with the repeats.
+A terminal shows a held key by repeating it; the command ends when the repeats end.
 """
 
 import math
@@ -28,15 +29,15 @@ BODY_KEYS: Mapping[str, tuple[float, float]] = {
     "z": (-1.0, -1.0),
     "c": (-1.0, 1.0),
 }
-"""Share of the linear and of the angular speed that a key asks for."""
+"""Factors of the linear and the angular speed, by key."""
 
 WHEEL_KEYS: Mapping[str, float] = {"w": 1.0, "up": 1.0, "s": -1.0, "down": -1.0}
 
 _SEQUENCE = re.compile(r"\x1b(?:\[|O)[0-9;]*([A-Za-z~])|\x1b|(.)", re.DOTALL)
 
 
-def keys_of(text: str) -> list[str]:
-    """Return the keys that a terminal's characters stand for.
+def parse_keys(text: str) -> list[str]:
+    """Return the keys in a terminal's characters.
 
     Examples
     --------
@@ -55,7 +56,7 @@ def keys_of(text: str) -> list[str]:
 
 @dataclass(frozen=True, kw_only=True)
 class Speeds:
-    """What a held key asks for."""
+    """Speeds of a held key."""
 
     linear: float = described(0.2, "Of the body [m/s].", name="linear_speed")
     angular: float = described(0.6, "Of the body [rad/s].", name="angular_speed")
@@ -72,31 +73,31 @@ class Speeds:
 
 
 class Keyboard:
-    """What the keys ask for now; the keys 1, 2, ... are the wheels in their order."""
+    """Commands of the keys; the keys 1, 2, ... select wheels."""
 
-    SLOWEST, FASTEST = 0.1, 4.0
+    MIN_SCALE, MAX_SCALE = 0.1, 4.0
 
     def __init__(self, speeds: Speeds, wheel_names: Sequence[str] = WHEELS) -> None:
         self.speeds = speeds
         self.wheel_names = tuple(wheel_names)
-        self.body_mode = True  # whether keys drive the body; else the selected wheels
+        self.body_mode = True  # False: the keys drive the selected wheels
         self.selected = set(self.wheel_names)
-        self.scale = 1.0  # by what + and - have changed the speeds
-        self.quitting = False  # whether the user asked to leave
+        self.scale = 1.0  # factor of the speeds, changed by + and -
+        self.quitting = False
         self._held = ""
         self._seen = -math.inf
 
     def press(self, key: str, now: float) -> None:
-        """Take in a key."""
+        """Handle a key."""
         motions: Mapping[str, object] = BODY_KEYS if self.body_mode else WHEEL_KEYS
         if key in motions:
             self._held, self._seen = key, now
             return
         self._held = ""
         if key in ("+", "="):
-            self.scale = min(self.scale * (1.0 + self.speeds.step), self.FASTEST)
+            self.scale = min(self.scale * (1.0 + self.speeds.step), self.MAX_SCALE)
         elif key in ("-", "_"):
-            self.scale = max(self.scale / (1.0 + self.speeds.step), self.SLOWEST)
+            self.scale = max(self.scale / (1.0 + self.speeds.step), self.MIN_SCALE)
         elif key == "m":
             self.body_mode = not self.body_mode
         elif key == "x":
@@ -107,11 +108,11 @@ class Keyboard:
             self.selected = {self.wheel_names[int(key) - 1]}
 
     def driving(self, now: float) -> bool:
-        """Tell whether a motion key is held."""
+        """Return whether a motion key is held."""
         return bool(self._held) and now - self._seen <= self.speeds.timeout
 
     def body(self, now: float) -> tuple[float, float]:
-        """Return the velocity asked of the body."""
+        """Return the commanded (linear, angular) velocity of the body."""
         linear, angular = BODY_KEYS.get(self._held, (0.0, 0.0)) if self.driving(now) else (0.0, 0.0)
         return (
             linear * self.scale * self.speeds.linear,
@@ -119,7 +120,7 @@ class Keyboard:
         )
 
     def wheels(self, now: float) -> dict[str, float]:
-        """Return the speed asked of every wheel."""
+        """Return the commanded speed of every wheel."""
         share = WHEEL_KEYS.get(self._held, 0.0) if self.driving(now) else 0.0
         speed = share * self.scale * self.speeds.wheel
         return {wheel: speed if wheel in self.selected else 0.0 for wheel in self.wheel_names}

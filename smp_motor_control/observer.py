@@ -1,15 +1,16 @@
-"""Motor speed from encoder counts and voltage by a steady-state Kalman filter.
+# SPDX-License-Identifier: Apache-2.0
+"""Steady-state Kalman filter of the motor speed from encoder counts and voltage.
 
-State ``(theta, w, w', d)`` of the identified motor (see :mod:`~smp_motor_control.motor.model`)
-with the load ``d`` as a random walk, so that the speed has no bias under any constant load:
+The state is ``(theta, w, w', d)`` of :mod:`~smp_motor_control.motor.model`.  The load d is a
+random walk, so that a constant load does not bias the speed:
 
     theta' = w,   tp w'' + tau w' + w = K (v - friction - d + n_v),   d' = n_d,
     counts = theta / q + quantisation, uniform, variance 1/12.
 
-Each step predicts exactly over its own dt (voltage held constant) and corrects with the
-steady-state gain for that dt.  Where the counts contradict the model, by the mean of the
-normalised innovation squared, the speed falls back to differenced counts until they agree.
-Stamps that scatter with variance ``s^2`` add ``(w s)^2`` to the variance of an innovation.
+Each step predicts exactly over its own dt (zero-order hold) and corrects with the steady-state
+gain of that dt.  While the mean normalised innovation squared shows that counts and model
+disagree, the speed is differenced from counts.  Stamp jitter of variance ``s^2`` adds
+``(w s)^2`` to the innovation variance.
 
 References
 ----------
@@ -35,25 +36,26 @@ from smp_motor_control.motor.response import FreeResponse, zero_order_hold
 
 _STEPS_PER_OCTAVE = 2
 _OCTAVES = 2
-_AGREE, DISAGREE = 3.0, 9.0
-INNOVATION_MEMORY = 0.05
-_LEVELS = 10
-_REGULAR = 0.5
-"""Of the usual interval, by which stamps scatter; what is farther off is a sample lost."""
-_DOUBLINGS = 100
+_TRUST_RATIO, DISTRUST_RATIO = 3.0, 9.0
+INNOVATION_MEMORY_S = 0.05
+_NOISE_LEVELS = 10
+_MAX_JITTER_SHARE = 0.5
+"""Largest stamp jitter, relative to the usual interval; beyond it a sample was lost."""
+_MAX_DOUBLINGS = 100
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(6)
 
 
 @dataclass(frozen=True, kw_only=True)
 class ObserverNoise:
-    """How far the observer trusts the model and the counts."""
+    """Process and measurement noise of the observer."""
 
-    # More of the first raises the bandwidth with which changes of the load are seen; the second
-    # stands for what the model leaves out, too; the third's default is quantisation alone.
-    load: float = described(1.0, "Wander of the load in one second, as a voltage [V/sqrt(s)].")
+    # A higher value raises the bandwidth of the load estimate.
+    load: float = described(1.0, "Random walk of the load, as a voltage [V/sqrt(s)].")
+    # Includes the error of the model.
     voltage: float = described(0.005, "White noise of the voltage [V sqrt(s)].")
+    # The default is quantisation only.
     count: float = described(
-        1.0 / math.sqrt(12.0), "Standard deviation of the encoder's error [counts]."
+        1.0 / math.sqrt(12.0), "Standard deviation of the encoder error [counts]."
     )
 
     def __post_init__(self) -> None:
@@ -62,18 +64,18 @@ class ObserverNoise:
 
 
 class SteadyGain(NamedTuple):
-    """Kalman gain in the steady state, per radian of innovation."""
+    """Steady-state Kalman gain per radian of innovation."""
 
     # angle, speed, acceleration, load: [-], [1/s], [1/s^2], [V/rad]
     angle: float
     speed: float
     acceleration: float
     load: float
-    variance: float  # of the innovation [rad^2]
+    variance: float  # innovation variance [rad^2]
 
 
 def prediction(model: MotorModel, intervals: Array) -> tuple[Array, Array]:
-    """Return the exact transition of ``(angle, w, w', d)`` and the effect of the voltage."""
+    """Return transition and input matrices of ``(angle, w, w', d)`` for each interval."""
     held = zero_order_hold(
         model.dc_gain, model.time_constant, model.time_constant_product, intervals
     )
@@ -88,12 +90,11 @@ def prediction(model: MotorModel, intervals: Array) -> tuple[Array, Array]:
 
 
 def steady_gain(model: MotorModel, quantum: float, noise: ObserverNoise, dt: float) -> SteadyGain:
-    """Return the steady-state Kalman gain for steps of a given length.
+    """Return the steady-state Kalman gain for steps of length ``dt``.
 
-    The noise of a step is gathered over a part of it that is short beside the fastest time
-    constant (Gauss-Legendre), then doubled, ``Q(2h) = F Q(h) F' + Q(h)``; the Riccati equation
-    is doubled as well.  Sums of positive terms alone: nothing overflows or cancels, however
-    small L/R is against the step.
+    Process noise is integrated by Gauss-Legendre over an interval shorter than the fastest time
+    constant, then doubled, ``Q(2h) = F Q(h) F' + Q(h)``; the Riccati equation is solved by doubling
+    too.  All sums have positive terms, so nothing cancels however small L/R is.
     """
     free = FreeResponse(model.time_constant, model.time_constant_product)
     gain, tau, tp = model.dc_gain, model.time_constant, free.product
@@ -101,7 +102,7 @@ def steady_gain(model: MotorModel, quantum: float, noise: ObserverNoise, dt: flo
     levels = max(math.ceil(math.log2(2.0 * dt * fastest)), 0)
     spans = dt * 2.0 ** np.arange(-levels, 1)
     F, _ = prediction(model, np.concatenate((spans, 0.5 * spans[0] * (1.0 + _NODES))))
-    # In counts, and in shares of a steady turn of one count per time constant.
+    # Scale angles to counts, and speeds to one count per time constant.
     lag = tau if not tp else 1.0 / fastest
     scale = quantum * np.array([1.0, 1.0 / tau, 1.0 / (tau * lag), 1.0 / (gain * tau)])
     F *= scale / scale[:, None]
@@ -118,11 +119,11 @@ def steady_gain(model: MotorModel, quantum: float, noise: ObserverNoise, dt: flo
 
 
 def _steady_covariance(F: Array, Q: Array, R: float) -> Array:
-    """Return the covariance before a measurement of the first state, by doubling."""
+    """Return the predicted covariance when the first state is measured, by doubling."""
     A, H, eye = F.T, Q, np.eye(len(Q))
     G = np.zeros_like(Q)
     G[0, 0] = 1.0 / R
-    for _ in range(_DOUBLINGS):
+    for _ in range(_MAX_DOUBLINGS):
         both = np.linalg.solve((eye + G @ H).T, np.concatenate((A, H)).T).T
         carried, seen = both[: len(Q)], both[len(Q) :]
         added = A.T @ seen @ A
@@ -135,12 +136,12 @@ def _steady_covariance(F: Array, Q: Array, R: float) -> Array:
 
 
 class SpeedObserver:
-    """Speed, acceleration [rad/s^2] and load of one motor, at its shaft.
+    """Observer of speed, acceleration [rad/s^2] and load of one motor, at its shaft.
 
-    Steps from a quarter to four times the usual interval are filtered.  The ``load`` is the voltage
-    [V] that it takes beyond the model, positive against forward turning; beyond ``max_load``, such
-    as 1.5 times the supply, it contradicts the model.  While model and counts do not agree the
-    speed is not ``trusted``, and is differenced over ``window`` samples.
+    Steps from a quarter to four times ``sample_time`` are filtered.  ``load`` is the voltage [V]
+    beyond the model, positive against forward motion; a load beyond ``max_load`` contradicts the
+    model.  While model and counts disagree the observer is not ``trusted``, and the speed is
+    differenced over ``window`` samples.
     """
 
     def __init__(
@@ -168,95 +169,96 @@ class SpeedObserver:
             self._shortest * 2 ** (k / _STEPS_PER_OCTAVE)
             for k in range(2 * _OCTAVES * _STEPS_PER_OCTAVE + 1)
         ]
-        # For counts as they are; for stamps that make them less certain as it is asked for, which
-        # is a fraction of a millisecond each.
-        self._gains = {(0, k): self._designed(0, k) for k in range(len(self._steps))}
-        # Below this speed the motor may stick: less than a count in the shortest memory.
+        # Gains for larger measurement noise are computed when needed, in less than a millisecond.
+        self._gains = {(0, k): self._design_gain(0, k) for k in range(len(self._steps))}
+        # Below this speed, less than a count in the shortest memory, the motor may stick.
         self._slow = self._quantum / max(8.0 * sample_time, 0.02)
         self._dt = 0.0
-        self._prepare(sample_time)
+        self._cache_step(sample_time)
         self.reset()
 
     def reset(self) -> None:
-        """Forget everything, as after lost feedback."""
+        """Discard the state, as after lost feedback."""
         self._unwrap.reset()
         self._differenced.reset()
-        self._known = False
+        self._has_state = False
         self._time = 0.0
         self._voltages: deque[tuple[float, float]] = deque()
         self._theta = self._speed = self.acceleration = self.load = 0.0
-        self._surprise = 1.0
+        self._innovation_ratio = 1.0
         self._jitter = 0.0  # variance of the stamps [s^2]
         self.trusted = True
-        self.speed = math.nan  # [rad/s], before the second sample
+        self.speed = math.nan  # [rad/s]; NaN before the second sample
 
     def step(self, count: int, voltage: float, dt: float) -> float:
-        """Take in one sample."""
+        """Return the speed [rad/s] after one more sample."""
         if not 0.0 < dt < math.inf or voltage - voltage != 0.0:
             raise ParameterError(f"observer got {voltage} V over {dt} s: must be finite, dt > 0")
         total = self._unwrap(count)
         self._time += dt
         differenced = self._differenced.step(self._time, total)
         angle = total * self._quantum
-        if not self._known or dt > self._longest:
+        if not self._has_state or dt > self._longest:
             self._restart(angle, differenced)
             return self.speed
         if dt != self._dt:
-            self._prepare(dt)
+            self._cache_step(dt)
         self._predict(self._delayed(voltage, dt) if self._model.delay else voltage, dt)
         variance = self._variance
         off = dt - self._usual
-        if -_REGULAR * self._usual < off < _REGULAR * self._usual:
+        if -_MAX_JITTER_SHARE * self._usual < off < _MAX_JITTER_SHARE * self._usual:
             self._jitter += self._memory * (0.5 * off * off - self._jitter)
         innovation = angle - self._theta
-        # A stamp that is off by e moves a turning encoder's angle by its speed times e: so much of
-        # what surprises is no contradiction, and the counts are as much less certain.
+        # A stamp error e changes the measured angle by speed times e, which raises the innovation
+        # variance without contradicting the model.
         scatter = 1.0 + self._speed * self._speed * self._jitter / variance
-        self._surprise += self._memory * (innovation * innovation / variance - self._surprise)
+        self._innovation_ratio += self._memory * (
+            innovation * innovation / variance - self._innovation_ratio
+        )
         g_theta, g_speed, g_acceleration, g_load, _ = self._gain_under(scatter)
         self._theta += g_theta * innovation
         self._speed += g_speed * innovation
         self.acceleration += g_acceleration * innovation
         self.load += g_load * innovation
-        unlike = self._surprise / scatter
-        if unlike > DISAGREE or abs(self.load) > self._max_load:
+        unlike = self._innovation_ratio / scatter
+        if unlike > DISTRUST_RATIO or abs(self.load) > self._max_load:
             if self.trusted:
                 self._restart(angle, differenced)
             self.trusted = False
-        elif unlike < _AGREE:
+        elif unlike < _TRUST_RATIO:
             self.trusted = True
         self.speed = self._speed if self.trusted else differenced
         return self.speed
 
     def _restart(self, angle: float, speed: float) -> None:
-        """Begin again at a measured angle and speed, with the load as last known."""
-        self._known = True
+        """Restart from a measured angle and speed, with the last load."""
+        self._has_state = True
         self._theta = angle
         self._speed = speed if speed == speed else 0.0
         self.acceleration = 0.0
         self.load = min(max(self.load, -self._max_load), self._max_load)
         self.speed = speed
 
-    def _prepare(self, dt: float) -> None:
-        """Compute what a step of this length needs; kept while the length stays the same."""
+    def _cache_step(self, dt: float) -> None:
+        """Cache the coefficients of steps of length ``dt``."""
         self._dt = dt
         place = math.log2(max(dt / self._shortest, 1.0)) * _STEPS_PER_OCTAVE
         self._place = min(round(place), len(self._steps) - 1)
         self._variance = self._gains[0, self._place].variance
-        self._memory = min(dt / INNOVATION_MEMORY, 1.0)
+        self._memory = min(dt / INNOVATION_MEMORY_S, 1.0)
         self._coefficients = self._free.after(dt)
 
     def _gain_under(self, scatter: float) -> SteadyGain:
-        """Return the gain for counts as uncertain as they show themselves, up to a ratio."""
-        ratio = self._surprise if self._surprise < scatter else scatter
-        level = 0 if ratio < 2.0 else min(round(0.5 * math.log2(ratio)), _LEVELS - 1)
+        """Return the gain for the observed innovation ratio, up to that of the stamp jitter."""
+        ratio = self._innovation_ratio if self._innovation_ratio < scatter else scatter
+        level = 0 if ratio < 2.0 else min(round(0.5 * math.log2(ratio)), _NOISE_LEVELS - 1)
         at = level, self._place
         if at not in self._gains:
-            self._gains[at] = self._designed(*at)
+            self._gains[at] = self._design_gain(*at)
         return self._gains[at]
 
-    def _designed(self, level: int, place: int) -> SteadyGain:
-        """Return the gain for counts that are ``2^level`` times as uncertain as they come."""
+    def _design_gain(self, level: int, place: int) -> SteadyGain:
+        """Return the gain for measurement noise that is ``2^level`` times the nominal."""
         noise = replace(self._noise, count=self._noise.count * 2.0**level)
         return steady_gain(self._model, self._quantum, noise, self._steps[place])
 
@@ -281,7 +283,7 @@ class SpeedObserver:
         self.acceleration = new_acceleration
 
     def _delayed(self, voltage: float, dt: float) -> float:
-        """Return the mean voltage that acted during the step, ``delay`` after it was applied."""
+        """Return the mean voltage during the step, delayed by the model's dead time."""
         past = self._voltages
         now = self._time
         past.append((now, voltage))

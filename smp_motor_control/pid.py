@@ -1,4 +1,5 @@
-"""Two-degree-of-freedom PID controller: one step from a reference and a measurement to volts.
+# SPDX-License-Identifier: Apache-2.0
+"""Two-degree-of-freedom PID controller.
 
 With ``e = r - y``, ``e_b = b r - y`` and ``e_c = c r - y`` one step computes
 
@@ -6,8 +7,8 @@ With ``e = r - y``, ``e_b = b r - y`` and ``e_c = c r - y`` one step computes
 ``output = clamp(unsaturated)``,
 ``integral += dt (i e + anti-windup)`` and clamps it,
 
-where ``f`` is a first-order filter.  The integral is advanced after the output (forward
-Euler), as control_toolbox does, so its configurations give the same numbers here.
+where ``f`` is a first-order filter.  The integral is advanced after the output (forward Euler),
+as in control_toolbox, so that equal configurations give equal numbers.
 
 References
 ----------
@@ -25,15 +26,15 @@ __all__ = ["EPSILON", "STRATEGIES", "Pid", "PidGains", "PidOutput"]
 
 
 class PidOutput(NamedTuple):
-    """What one step of a controller computed; immutable, a new one every step."""
+    """Result of one step."""
 
-    output: float  # the command within its clamps; NaN when an input was not finite
-    unsaturated: float  # the command before its clamps
+    output: float  # clamped command; NaN for non-finite inputs
+    unsaturated: float  # command before clamping
     p_term: float
-    i_term: float  # the integral after the step; the command holds the one before it
+    i_term: float  # integral after the step; the command contains the one before
     d_term: float
     feedforward: float
-    saturated: bool  # whether the clamps changed the command
+    saturated: bool  # whether clamping changed the command
 
 
 _NAN = math.nan
@@ -53,7 +54,7 @@ class Pid:
     gains : PidGains
         Settings in force.
     i_term : float
-        The integral term as it will enter the next step.
+        Integral term of the next step.
 
     Examples
     --------
@@ -64,17 +65,17 @@ class Pid:
 
     gains: PidGains
     i_term: float
-    _previous: float | None  # c r - y of the step before
+    _previous: float | None  # c r - y of the previous step
     _rate: float  # filtered rate of c r - y
-    _seen: tuple[float, float, float] | None  # inputs of the last step
-    _last: PidOutput
+    _last_inputs: tuple[float, float, float] | None  # inputs of the last step
+    _last_output: PidOutput
 
     def __init__(self, gains: PidGains) -> None:
         self.reset()
         self._adopt(gains)
 
     def _adopt(self, gains: PidGains) -> None:
-        """Copy the settings to where a step finds them without a second look-up."""
+        """Copy the settings to attributes, which saves look-ups in a step."""
         self.gains = gains
         self._p, self._i, self._d = gains.p, gains.i, gains.d
         self._u_min, self._u_max = gains.u_clamp_min, gains.u_clamp_max
@@ -92,13 +93,13 @@ class Pid:
 
     @property
     def tracking_time_constant(self) -> float:
-        """Time constant [s] of back-calculation in force, its default filled in."""
+        """Effective time constant of back-calculation [s]."""
         return self._tracking
 
     @property
     def saturated(self) -> bool:
-        """Whether the clamps changed the last command."""
-        return self._last.saturated
+        """Whether clamping changed the last command."""
+        return self._last_output.saturated
 
     def step(
         self,
@@ -113,22 +114,20 @@ class Pid:
         Parameters
         ----------
         reference, measurement : float
-            What is asked for and what is; [rad/s] at the wheel.
+            Reference and measured speed [rad/s, wheel].
         dt : float
-            Time since the step before [s].  With 0 nothing changes and the output of the
-            step before is returned.
+            Time since the previous step [s].  With 0 the previous output is returned.
         acceleration : float
-            Rate of the reference [rad/s^2], for the feed-forward alone.
+            Rate of the reference [rad/s^2], for the feed-forward only.
         error_rate : float, optional
-            Rate of ``c r - y`` [rad/s^2] where a sensor or an observer tells it; replaces
-            differencing, not the filter.  Such a step is not what a later one differences
-            from, as in control_toolbox.
+            Measured rate of ``c r - y`` [rad/s^2]; replaces differencing, not the filter.  A later
+            step does not difference from such a step, as in control_toolbox.
 
         Returns
         -------
         PidOutput
-            All NaN but the unchanged integral where an input is not finite: nothing is
-            remembered of such a step.
+            All NaN except the unchanged integral when an input is not finite; such a step has no
+            effect on later ones.
 
         Raises
         ------
@@ -137,13 +136,13 @@ class Pid:
 
         Notes
         -----
-        Before the first step the reference is taken to have rested at the measurement, so
-        that a controller which is enabled on a turning wheel gives no derivative kick
-        unless ``setpoint_weight_d`` asks for it.
+        Before the first step the reference is assumed equal to the measurement, so that enabling
+        the controller on a turning wheel gives no derivative kick unless ``setpoint_weight_d``
+        is set.
         """
         if not EPSILON < dt < _INF:
             if -EPSILON <= dt <= EPSILON:
-                return self._last
+                return self._last_output
             raise ParameterError(f"dt is {dt} s: must be finite and not negative")
         error = reference - measurement
         weighted = self._weight_d * reference - measurement
@@ -167,17 +166,17 @@ class Pid:
         if error_rate is None:
             self._previous = weighted
         self._rate = rate if -_INF < rate < _INF else 0.0
-        self._seen = (reference, measurement, acceleration)
+        self._last_inputs = (reference, measurement, acceleration)
         last = PidOutput(
             output, unsaturated, p_term, i_term, d_term, feedforward, output != unsaturated
         )
-        self._last = last
+        self._last_output = last
         return last
 
     def _filtered_rate(
         self, weighted: float, measurement: float, dt: float, given: float | None
     ) -> float:
-        """Return the rate of ``c r - y``: backward Euler of ``s / (1 + T s)``."""
+        """Return the rate of ``c r - y`` by backward Euler of ``s / (1 + T s)``."""
         if given is None:
             previous = self._previous
             if previous is None:
@@ -190,10 +189,9 @@ class Pid:
         return (self._filter * self._rate + change) / (self._filter + dt)
 
     def _feedforward(self, reference: float, acceleration: float) -> float:
-        """Return the voltage that the model says the reference needs.
+        """Return the feed-forward voltage.
 
-        Dry friction opposes the direction of turning; at a reference of zero that is the
-        direction in which the reference is about to go.
+        Dry friction opposes the reference; at a reference of zero it opposes the acceleration.
         """
         value = self._ff_velocity * reference + self._ff_acceleration * acceleration
         if self._ff_static:
@@ -205,7 +203,7 @@ class Pid:
         return value
 
     def _integrate(self, error: float, dt: float, output: float, unsaturated: float) -> float:
-        """Return the integral after a step of ``dt`` with the anti-windup in force."""
+        """Return the integral after a step of ``dt``, with anti-windup."""
         gain = self._i
         old = self.i_term
         if self._back_calculation:
@@ -226,12 +224,12 @@ class Pid:
         return new if -_INF < new < _INF else old
 
     def _refuse(self) -> PidOutput:
-        """Return NaN for a step whose inputs mean nothing; only the answer is remembered."""
-        self._last = PidOutput(_NAN, _NAN, _NAN, self.i_term, _NAN, _NAN, False)
-        return self._last
+        """Return NaN for a step with non-finite inputs."""
+        self._last_output = PidOutput(_NAN, _NAN, _NAN, self.i_term, _NAN, _NAN, False)
+        return self._last_output
 
     def reset(self, save_i_term: bool = False) -> None:
-        """Forget the past, as before the first step.
+        """Discard the state.
 
         Parameters
         ----------
@@ -242,27 +240,26 @@ class Pid:
             self.i_term = 0.0
         self._previous = None
         self._rate = 0.0
-        self._seen = None
-        self._last = PidOutput(0.0, 0.0, 0.0, self.i_term, 0.0, 0.0, False)
+        self._last_inputs = None
+        self._last_output = PidOutput(0.0, 0.0, 0.0, self.i_term, 0.0, 0.0, False)
 
     def set_gains(self, gains: PidGains) -> None:
-        """Change the settings without a jump of the command.
+        """Change the settings without a jump of the command (bumpless transfer).
 
-        The integral takes up what the other terms change by at the inputs of the last step,
-        as far as its clamps let it.  Without integral action there is nothing that could
-        unwind it later: the integral is zero then.
+        The integral absorbs the change of the other terms at the last inputs, within its clamps.
+        Without integral action it is set to zero, as nothing could unwind it later.
         """
         before = self._without_integral()
         self._adopt(gains)
-        if self._seen is not None and self._previous is not None:
-            self._previous = self._weight_d * self._seen[0] - self._seen[1]
+        if self._last_inputs is not None and self._previous is not None:
+            self._previous = self._weight_d * self._last_inputs[0] - self._last_inputs[1]
         self._store_integral(self.i_term + before - self._without_integral())
 
     def _without_integral(self) -> float:
-        """Return the command at the last inputs less its integral term."""
-        if self._seen is None:
+        """Return the command at the last inputs without its integral term."""
+        if self._last_inputs is None:
             return 0.0
-        reference, measurement, acceleration = self._seen
+        reference, measurement, acceleration = self._last_inputs
         return (
             self._p * (self._weight_p * reference - measurement)
             + self._d * self._rate
@@ -273,4 +270,4 @@ class Pid:
         if abs(self._i) <= EPSILON or not math.isfinite(value):
             value = 0.0
         self.i_term = min(max(value, self._i_min), self._i_max)
-        self._last = self._last._replace(i_term=self.i_term)
+        self._last_output = self._last_output._replace(i_term=self.i_term)

@@ -1,4 +1,5 @@
-"""Settings of the PID controller, validated before they are used."""
+# SPDX-License-Identifier: Apache-2.0
+"""Validated settings of the PID controller."""
 
 import math
 from dataclasses import dataclass
@@ -7,22 +8,22 @@ from smp_motor_control.errors import ParameterError, check_range
 from smp_motor_control.fields import described, documented, parameters_in
 
 EPSILON = 2.220446049250313e-16
-"""Smallest number that counts as other than zero: of an error, a gain or a time step."""
+"""Errors, gains and time steps up to this size count as zero."""
 
-LARGEST = 1e9
-"""Of any gain, weight, clamp or time constant; products of three stay finite."""
+MAX_GAIN = 1e9
+"""Maximum of any gain, weight, clamp or time constant; products of three stay finite."""
 
 STRATEGIES = ("none", "back_calculation", "conditional_integration")
-"""What may keep the integral from winding up while the output is clamped."""
+"""Anti-windup strategies."""
 
 
-_CLAMP = "limit of the output [V]; the supply limits it too."
+_CLAMP = "limit of the output [V], in addition to the supply."
 
 
 @documented
 @dataclass(frozen=True, kw_only=True, slots=True)
 class PidGains:
-    """Validated settings of a PID controller; names as in control_toolbox.
+    """Validated settings of a PID controller, named as in control_toolbox.
 
     Raises
     ------
@@ -54,15 +55,15 @@ class PidGains:
         "back) or conditional_integration (it stops winding up).",
     )
     tracking_time_constant: float = described(
-        0.0, "Of back-calculation [s]; 0: sqrt(d/i), or p/i without derivative action.", minimum=0.0
+        0.0, "Time constant of back-calculation [s]; 0: sqrt(d/i), or p/i without d.", minimum=0.0
     )
     error_deadband: float = described(
-        EPSILON, "Error up to which the integral rests [rad/s].", minimum=0.0
+        EPSILON, "Error up to which the integral is frozen [rad/s].", minimum=0.0
     )
-    setpoint_weight_p: float = described(1.0, "Share of the reference in the proportional term.")
-    setpoint_weight_d: float = described(0.0, "Share of the reference in the derivative term.")
+    setpoint_weight_p: float = described(1.0, "Weight of the reference in the proportional term.")
+    setpoint_weight_d: float = described(0.0, "Weight of the reference in the derivative term.")
     derivative_filter_time_constant: float = described(
-        0.0, "Of the derivative's filter, of first order [s]; 0: unfiltered.", minimum=0.0
+        0.0, "Time constant of the first-order derivative filter [s]; 0: none.", minimum=0.0
     )
     feedforward_static: float = described(
         0.0, "Voltage against dry friction, in the direction of the reference [V].", minimum=0.0
@@ -72,10 +73,10 @@ class PidGains:
 
     def __post_init__(self) -> None:
         _check_strategy(self.antiwindup_strategy)
-        for name, least in _LEAST.items():
+        for name, least in _MIN_VALUES.items():
             value = getattr(self, name)
             if not ("_clamp_" in name and value in (-math.inf, math.inf)):
-                value = check_range(name, value, least, LARGEST)
+                value = check_range(name, value, least, MAX_GAIN)
             object.__setattr__(self, name, value)
         if not self.u_clamp_min < self.u_clamp_max:
             raise ParameterError(
@@ -90,9 +91,9 @@ class PidGains:
 
     @property
     def effective_tracking_time_constant(self) -> float:
-        """Time constant [s] of back-calculation with the default for 0 filled in.
+        """Time constant of back-calculation [s], with the default for 0 filled in.
 
-        It is 0 where that default is 0 too: the integral then follows the clamp at once.
+        With an effective value of 0 the integral follows the clamp at once.
         """
         given = self.tracking_time_constant
         if given > EPSILON or abs(self.i) <= EPSILON:
@@ -102,8 +103,8 @@ class PidGains:
         return abs(self.p / self.i)
 
 
-_LEAST = {
-    name: max(one.minimum, -LARGEST)
+_MIN_VALUES = {
+    name: max(one.minimum, -MAX_GAIN)
     for name, one in parameters_in(PidGains).items()
     if name != "antiwindup_strategy"
 }

@@ -1,10 +1,11 @@
-"""Arguments of a program beside those of ROS."""
+# SPDX-License-Identifier: Apache-2.0
+"""Separation of a program's arguments from those of ROS."""
 
 from collections.abc import Sequence
 
 
 def split_arguments(argv: Sequence[str]) -> tuple[list[str], list[str]]:
-    """Return a program's own arguments, and those from ``--ros-args`` to ``--``.
+    """Return a program's own arguments and those from ``--ros-args`` to ``--``.
 
     Examples
     --------

@@ -1,7 +1,8 @@
-"""The line protocol between a host and a motor board, for the simplest firmware.
+# SPDX-License-Identifier: Apache-2.0
+"""Serial line protocol between a host and a motor board.
 
-Lines of ASCII that end with ``*`` and the exclusive-or of the characters before it in two
-hexadecimal digits, as NMEA 0183 sentences do; a line whose sum does not fit is dropped.
+Lines are ASCII and end with ``*`` and the exclusive-or of the preceding characters in two
+hexadecimal digits, as in NMEA 0183; lines with a wrong checksum are dropped.
 
 ============================================= ========================================
 board to host, at its samples, <= 0.1 s apart ``S,US,BATTERY,COUNT,MA,COUNT,MA,...``
@@ -9,11 +10,11 @@ host to board, <= 0.1 s apart                 ``A,US`` and ``V,MV,MV,...``
 ============================================= ========================================
 
 ``US`` is the board's clock [us, modulo 2^32], ``BATTERY`` its supply [mV], ``COUNT`` a signed
-encoder count and ``MA`` a current [mA]; battery and current are empty where they are not measured.
-``V`` holds the armature voltages [mV], and the ``A`` before it the clock of the newest ``S`` that
-the host has heard: a board that compares it with its own clock knows how old the command is, and
-drops what waited in a queue.  A board that hears no valid, fresh ``V`` for 0.2 s turns its motors
-off; a host that hears no ``S`` for as long sends nothing.
+encoder count and ``MA`` a current [mA]; battery and current are empty if not measured.  ``V``
+holds the armature voltages [mV].  The ``A`` before it repeats the clock of the newest ``S``
+received, from which the board computes the age of the command and drops old ones.  Without a
+fresh ``V`` for 0.2 s the board turns its motors off; without an ``S`` for 0.2 s the host sends
+nothing.
 """
 
 import math
@@ -23,28 +24,28 @@ from typing import NamedTuple
 
 from smp_motor_control.errors import ParameterError
 
-LONGEST = 512
-"""Characters without an end of line after which they are noise."""
+MAX_LINE_LENGTH = 512
+"""Longer lines are discarded as noise."""
 
-CLOCK = 1 << 32
-"""The board's clock begins anew after so many microseconds."""
+CLOCK_PERIOD_US = 1 << 32
+"""Range of the board's clock [us]."""
 
 
 _INTEGER = re.compile(r"-?[0-9]{1,18}")
-"""What fits 64 bits and every counter."""
+"""Whole numbers that fit in 64 bits."""
 
 
 class BoardState(NamedTuple):
-    """What a board reported at one instant."""
+    """State reported by a board."""
 
     clock: int  # [us], wraps
-    battery: float  # [V]; NaN where not measured
-    counts: tuple[int, ...]  # of each motor's encoder
-    currents: tuple[float, ...]  # [A]; NaN where not measured
+    battery: float  # [V]; NaN if not measured
+    counts: tuple[int, ...]  # encoder counts of the motors
+    currents: tuple[float, ...]  # [A]; NaN if not measured
 
 
 def checksum(text: str) -> str:
-    """Return the exclusive-or of characters, as two hexadecimal digits."""
+    """Return the exclusive-or of the characters as two hexadecimal digits."""
     total = 0
     for character in text.encode("ascii", "replace"):
         total ^= character
@@ -52,12 +53,12 @@ def checksum(text: str) -> str:
 
 
 def encode(text: str) -> bytes:
-    """Return a line with its sum."""
+    """Return a line with its checksum."""
     return f"{text}*{checksum(text)}\n".encode("ascii")
 
 
 def encode_voltages(voltages: Sequence[float]) -> bytes:
-    r"""Return the command of all motors.
+    r"""Return the command line of all motors.
 
     Examples
     --------
@@ -69,7 +70,7 @@ def encode_voltages(voltages: Sequence[float]) -> bytes:
 
 
 def encode_age(clock: int) -> bytes:
-    r"""Return the line that tells a board which of its states the next command answers.
+    r"""Return the line with the clock of the state that the next command responds to.
 
     Examples
     --------
@@ -80,38 +81,38 @@ def encode_age(clock: int) -> bytes:
 
 
 def decode_state(line: str, motors: int) -> BoardState:
-    """Read a board's line."""
+    """Parse a line from the board."""
     text, _, sum_ = line.strip().rpartition("*")
     fields = text.split(",")
     if checksum(text) != sum_.upper() or fields[0] != "S":
-        raise ParameterError(f"spoilt line {line[:40]!r}")
+        raise ParameterError(f"line with a wrong checksum: {line[:40]!r}")
     if len(fields) != 3 + 2 * motors:
-        raise ParameterError(f"line of {(len(fields) - 3) // 2} motors, not of {motors}")
+        raise ParameterError(f"line with {(len(fields) - 3) // 2} motors instead of {motors}")
     counts, currents = fields[3::2], fields[4::2]
     for field in (fields[1], *counts, *filter(None, (fields[2], *currents))):
         if not _INTEGER.fullmatch(field):
-            raise ParameterError(f"line with a field that is no whole number: {line[:40]!r}")
+            raise ParameterError(f"line with a field that is not a whole number: {line[:40]!r}")
     return BoardState(
-        int(fields[1]) % CLOCK,
-        _thousandth(fields[2]),
+        int(fields[1]) % CLOCK_PERIOD_US,
+        _parse_thousandths(fields[2]),
         tuple(map(int, counts)),
-        tuple(map(_thousandth, currents)),
+        tuple(map(_parse_thousandths, currents)),
     )
 
 
-def _thousandth(field: str) -> float:
+def _parse_thousandths(field: str) -> float:
     return 1e-3 * int(field) if field else math.nan
 
 
-class Lines:
-    """Cuts a stream of bytes into lines."""
+class LineSplitter:
+    """Split a stream of bytes into lines."""
 
     def __init__(self) -> None:
         self._rest = b""
 
     def feed(self, data: bytes) -> list[str]:
-        """Return the lines that are whole now."""
+        """Return the lines completed by new data."""
         *lines, self._rest = (self._rest + data).split(b"\n")
-        if len(self._rest) > LONGEST:
+        if len(self._rest) > MAX_LINE_LENGTH:
             self._rest = b""
         return [line.decode("ascii", "replace") for line in lines]

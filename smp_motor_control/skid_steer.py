@@ -1,4 +1,5 @@
-"""Kinematics of a skid-steered body, by the names that scripts rely on."""
+# SPDX-License-Identifier: Apache-2.0
+"""Public names of the skid-steered body."""
 
 from smp_motor_control.body.kinematics import SkidSteer
 from smp_motor_control.body.odometry import Odometry

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Every field of every message says in what unit it is, and every message is built."""
 
 from __future__ import annotations

@@ -1,1 +1,2 @@
-"""The body on its wheels: kinematics, limits and odometry."""
+# SPDX-License-Identifier: Apache-2.0
+"""The robot's body: kinematics, limits and odometry."""

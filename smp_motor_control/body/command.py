@@ -1,4 +1,5 @@
-"""What the body is asked to do, and for how long that holds."""
+# SPDX-License-Identifier: Apache-2.0
+"""The body's velocity command and its time-out."""
 
 import math
 from enum import Enum
@@ -7,7 +8,7 @@ from smp_motor_control.errors import check_positive
 
 
 class Verdict(Enum):
-    """What became of a command that arrived."""
+    """Result of receiving a command."""
 
     ACCEPTED = "accepted"
     ZERO_STAMP = "accepted; its stamp is zero, taken as now"
@@ -16,12 +17,11 @@ class Verdict(Enum):
 
 
 class BodyCommand:
-    """The newest velocity command, which brakes when it is not renewed in time; 0: it never does.
+    """Hold the newest velocity command until it times out; a time-out of 0 disables this.
 
-    Age is counted on a steady clock from the arrival, plus the age that the command had then
-    by its stamp, so that a jump of the wall clock or a stamp from the future cannot keep
-    wheels turning.  A command that is not finite is no sign of life: the body brakes after the
-    ordinary time-out (diff_drive_controller drives on for as long as such messages come).
+    The age is measured on a steady clock from arrival, plus the age by the stamp at arrival, so
+    that clock jumps and stamps from the future cannot keep wheels turning.  A non-finite command
+    does not restart the time-out (diff_drive_controller keeps driving on such messages).
     """
 
     def __init__(self, timeout: float = 0.5) -> None:
@@ -34,14 +34,14 @@ class BodyCommand:
         self.timeout = timeout
 
     def reset(self) -> None:
-        """Forget every command: nothing is asked until the next one."""
+        """Discard all commands."""
         self._velocity: tuple[float, float] | None = None
         self._born = -math.inf
 
     def receive(
         self, linear: float, angular: float, age: float | None, steady_now: float
     ) -> Verdict:
-        """Take in a command."""
+        """Accept or drop a command."""
         if age is not None and self.timeout > 0.0 and not age < self.timeout:
             return Verdict.STALE
         if not (math.isfinite(linear) and math.isfinite(angular)):
@@ -51,15 +51,15 @@ class BodyCommand:
         return Verdict.ZERO_STAMP if age is None else Verdict.ACCEPTED
 
     def age(self, steady_now: float) -> float:
-        """Return how old the newest command is."""
+        """Return the age of the newest command [s]."""
         return steady_now - self._born
 
     def timed_out(self, steady_now: float) -> bool:
-        """Tell whether the command is too old to be followed."""
+        """Return whether the newest command has expired."""
         return self.timeout > 0.0 and self.age(steady_now) > self.timeout
 
     def at(self, steady_now: float) -> tuple[float, float] | None:
-        """Return the velocity that is asked for."""
+        """Return the commanded (linear, angular) velocity; None before the first command."""
         if self._velocity is None:
             return None
         return (0.0, 0.0) if self.timed_out(steady_now) else self._velocity

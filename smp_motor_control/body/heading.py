@@ -1,4 +1,5 @@
-"""Holding the heading of the body against uneven ground, with a yaw from outside."""
+# SPDX-License-Identifier: Apache-2.0
+"""Heading control of the body by a measured yaw."""
 
 import math
 from dataclasses import dataclass
@@ -7,17 +8,17 @@ from smp_motor_control.errors import check_positive
 from smp_motor_control.fields import described
 
 
-def wrapped(angle: float) -> float:
+def wrap_angle(angle: float) -> float:
     """Return an angle in [-pi, pi]."""
     return math.remainder(angle, 2.0 * math.pi)
 
 
 @dataclass(eq=False)
 class HeadingHold:
-    """PI controller of the yaw whose reference is the integral of the commanded yaw rate.
+    """PI controller of the yaw; its reference is the integral of the commanded yaw rate.
 
-    ``w_out = w_cmd + clamp(p e + i integral(e))`` with ``e = wrap(integral(w_cmd) - yaw)``.  Beyond
-    ``max_error`` the body was turned by something stronger: the present yaw is the new reference.
+    ``w_out = w_cmd + clamp(p e + i integral(e))`` with ``e = wrap(integral(w_cmd) - yaw)``.  An
+    error beyond ``max_error`` resets the reference to the measured yaw.
 
     Examples
     --------
@@ -33,10 +34,10 @@ class HeadingHold:
         0.5, "Integral gain of the heading [1/s^2].", minimum=0.0, name="heading_i"
     )
     max_correction: float = described(
-        0.5, "Largest yaw rate that is added [rad/s].", name="heading_max_correction"
+        0.5, "Maximum correction of the yaw rate [rad/s].", name="heading_max_correction"
     )
     max_error: float = described(
-        0.7, "Beyond this the present heading is taken for the wanted one [rad].",
+        0.7, "Error that resets the reference to the measured yaw [rad].",
         name="heading_max_error",
     )  # fmt: skip
 
@@ -48,20 +49,20 @@ class HeadingHold:
         self.reset()
 
     def reset(self) -> None:
-        """Take the next yaw as the reference; for a body at rest, or without a yaw."""
+        """Restart from the next yaw; for a body at rest or without a yaw."""
         self._reference: float | None = None
         self._integral = 0.0
 
     def step(self, angular: float, yaw: float, dt: float) -> float:
-        """Return the yaw rate to command so that the heading follows the one asked for."""
+        """Return the corrected yaw rate [rad/s]."""
         if not math.isfinite(yaw):
             self.reset()
             return angular
         if self._reference is None:
             self._reference = yaw
             return angular
-        self._reference = wrapped(self._reference + angular * dt)
-        error = wrapped(self._reference - yaw)
+        self._reference = wrap_angle(self._reference + angular * dt)
+        error = wrap_angle(self._reference - yaw)
         if abs(error) > self.max_error:
             self._reference, self._integral = yaw, 0.0
             return angular

@@ -1,4 +1,5 @@
-"""Kinematics of a body on two sides of wheels that steers by skidding.
+# SPDX-License-Identifier: Apache-2.0
+"""Kinematics of a skid-steered body.
 
 ``left = (v - w B/2) / (r m_left)``, ``right = (v + w B/2) / (r m_right)`` with the effective
 separation ``B = wheel_separation * wheel_separation_multiplier``; angles counter-clockwise.
@@ -23,12 +24,12 @@ class SideSpeeds(NamedTuple):
 @documented
 @dataclass(frozen=True, kw_only=True)
 class SkidSteer:
-    """Geometry of the body, and what its wheels can do.
+    """Geometry of the body and speed limit of its wheels.
 
     Raises
     ------
     ParameterError
-        When a value is not positive.
+        When a value is not positive and finite.
 
     Examples
     --------
@@ -36,15 +37,15 @@ class SkidSteer:
     SideSpeeds(left=-2.0, right=2.0)
     """
 
-    wheel_separation: float = described(MISSING, "Between left and right wheels [m].")
+    wheel_separation: float = described(MISSING, "Distance between left and right wheels [m].")
     wheel_radius: float = described(MISSING, "Radius of the wheels [m].")
     wheel_separation_multiplier: float = described(
-        1.0, "Above 1 for a body that turns less than its wheels would roll it."
+        1.0, "Above 1 for a body that turns less than ideal rolling predicts."
     )
     left_wheel_radius_multiplier: float = described(1.0, "Correction of the left radius.")
     right_wheel_radius_multiplier: float = described(1.0, "Correction of the right radius.")
     max_wheel_speed: float = described(
-        math.inf, "What every wheel reaches [rad/s]; commands beyond are scaled.",
+        math.inf, "Maximum speed of every wheel [rad/s]; commands beyond it are scaled.",
         minimum=0.0, name="max_wheel_velocity", endless=True,
     )  # fmt: skip
 
@@ -56,7 +57,7 @@ class SkidSteer:
 
     @property
     def effective_separation(self) -> float:
-        """Separation [m] that wheels without skid would need to turn as the body does."""
+        """Separation [m] of ideally rolling wheels with the same yaw rate."""
         return self.wheel_separation * self.wheel_separation_multiplier
 
     @property
@@ -70,23 +71,23 @@ class SkidSteer:
         return self.wheel_radius * self.right_wheel_radius_multiplier
 
     def wheel_speeds(self, linear: float, angular: float) -> SideSpeeds:
-        """Return the wheel speeds that roll the body as asked."""
+        """Return the wheel speeds of a body velocity."""
         half = angular * self.effective_separation / 2.0
         return SideSpeeds((linear - half) / self.left_radius, (linear + half) / self.right_radius)
 
     def body_velocity(self, left: float, right: float) -> tuple[float, float]:
-        """Return how the body moves when its wheels turn."""
+        """Return the body's (linear, angular) velocity at given wheel speeds."""
         left, right = left * self.left_radius, right * self.right_radius
         return (left + right) / 2.0, (right - left) / self.effective_separation
 
     def reachable_share(self, linear: float, angular: float) -> float:
-        """Return the share of a command, at most 1, that all wheels can follow on its path."""
+        """Return the factor, at most 1, that scales a command to the wheels' speed limit."""
         fastest = max(map(abs, self.wheel_speeds(linear, angular)))
-        if math.isinf(fastest):  # beyond what a number can hold
+        if math.isinf(fastest):  # overflow
             return 0.0
         return 1.0 if fastest <= self.max_wheel_speed else self.max_wheel_speed / fastest
 
     def reachable_wheel_speeds(self, linear: float, angular: float) -> SideSpeeds:
-        """Return the wheel speeds for a command, scaled until every wheel can follow."""
+        """Return the wheel speeds of a command, scaled to their limit."""
         share = self.reachable_share(linear, angular)
         return self.wheel_speeds(linear * share, angular * share)

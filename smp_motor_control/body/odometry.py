@@ -1,4 +1,5 @@
-"""Where a body with two sides of wheels is, from how they turned, and how sure that is."""
+# SPDX-License-Identifier: Apache-2.0
+"""Odometry of a skid-steered body, with its covariance."""
 
 import math
 from collections import deque
@@ -7,31 +8,30 @@ import numpy as np
 
 from smp_motor_control.errors import ParameterError, check_positive
 
-LEAST_STEP = 1e-6
-"""Time steps [s] below this one are not integrated."""
+MIN_STEP_S = 1e-6
+"""Shortest time step that is integrated."""
 
 
 class Odometry:
-    """Pose and velocity of the body from the turning of its wheels.
+    """Pose and velocity of the body from the motion of its wheels.
 
-    Over one step the body moves on an arc, ``h1 = h0 + w dt``,
+    One step follows an arc, ``h1 = h0 + w dt``,
     ``x += v/w (sin h1 - sin h0)``, ``y -= v/w (cos h1 - cos h0)``.
 
     Parameters
     ----------
     wheel_separation : float
-        Between the sides, with its multiplier for skid [m].
+        Effective distance between the sides [m].
     left_radius, right_radius : float
-        Of the wheels, with their multipliers [m].
+        Effective wheel radii [m].
     window : int
-        Number of steps that the reported velocity is averaged over.
+        Number of steps over which the reported velocity is averaged.
     travel_noise : float
-        Variance of a side's travel that one metre adds [m^2/m].
+        Variance of a side's travel per metre [m^2/m].
     turn_noise : float
-        Variance of the heading that a turn by one radian adds [rad^2/rad]: the skid.
+        Variance of the heading per radian of turning, due to skid [rad^2/rad].
     max_wheel_speed : float
-        Positions that would need a faster wheel are a counter that was reset, not motion
-        [rad/s].
+        Maximum wheel speed [rad/s]; a faster change of position is a counter reset.
 
     Attributes
     ----------
@@ -45,7 +45,7 @@ class Odometry:
     Raises
     ------
     ParameterError
-        When a length is not positive, a noise negative, or the window below 1.
+        When a length is not positive, a noise is negative, or the window is below 1.
 
     References
     ----------
@@ -88,7 +88,7 @@ class Odometry:
         travel_noise: float,
         turn_noise: float,
     ) -> None:
-        """Change the geometry or the noise from the next step on; the pose stays."""
+        """Change geometry and noise from the next step on; keep the pose."""
         check_positive("wheel_separation", wheel_separation, "m")
         check_positive("left_radius", left_radius, "m")
         check_positive("right_radius", right_radius, "m")
@@ -98,20 +98,20 @@ class Odometry:
         self._travel_noise, self._turn_noise = travel_noise, turn_noise
 
     def reset(self) -> None:
-        """Start at the origin, at rest, with no wheel position known."""
+        """Restart at the origin, at rest, without wheel positions."""
         self.set_odometry(0.0, 0.0, 0.0)
         self._positions: tuple[float, float] | None = None
         self.linear = self.angular = 0.0
         self._velocities.clear()
 
     def set_odometry(self, x: float, y: float, heading: float) -> None:
-        """Declare where the body is, without doubt."""
+        """Set the pose, with zero covariance."""
         self.x, self.y, self.heading = x, y, heading
         self.covariance = np.zeros((3, 3))
 
     def update_from_velocity(self, left: float, right: float, dt: float) -> bool:
-        """Integrate the mean speeds of both sides [rad/s]; False where nothing could be."""
-        if not (LEAST_STEP <= dt < math.inf and math.isfinite(left) and math.isfinite(right)):
+        """Integrate both sides' mean wheel speeds [rad/s]; return False for invalid inputs."""
+        if not (MIN_STEP_S <= dt < math.inf and math.isfinite(left) and math.isfinite(right)):
             return False
         left, right = left * self._left, right * self._right
         if not math.isfinite((abs(left) + abs(right)) * dt):
@@ -126,9 +126,9 @@ class Odometry:
     def update_from_travel(
         self, left: float, right: float, left_speed: float, right_speed: float
     ) -> bool:
-        """Integrate how far both sides turned [rad], and take their speeds [rad/s] as they are.
+        """Integrate the travel of both sides [rad] and adopt their speeds [rad/s].
 
-        False where a number is not finite: nothing has changed.
+        Returns False, without any change, when a number is not finite.
         """
         if not math.isfinite(abs(left) + abs(right) + abs(left_speed) + abs(right_speed)):
             return False
@@ -138,8 +138,8 @@ class Odometry:
         return True
 
     def update_from_position(self, left: float, right: float, dt: float) -> bool:
-        """Integrate the difference of wheel positions to those of the step before."""
-        if not (LEAST_STEP <= dt < math.inf and math.isfinite(left) and math.isfinite(right)):
+        """Integrate the change of the wheel positions since the previous step."""
+        if not (MIN_STEP_S <= dt < math.inf and math.isfinite(left) and math.isfinite(right)):
             return False
         before, self._positions = self._positions, (left, right)
         if before is None:
@@ -150,8 +150,8 @@ class Odometry:
         return self.update_from_velocity(turned_left / dt, turned_right / dt, dt)
 
     def update_open_loop(self, linear: float, angular: float, dt: float) -> bool:
-        """Integrate what was commanded [m/s], [rad/s], where no wheel tells how it turned."""
-        if not (LEAST_STEP <= dt < math.inf and math.isfinite(linear) and math.isfinite(angular)):
+        """Integrate the command [m/s], [rad/s] without wheel feedback."""
+        if not (MIN_STEP_S <= dt < math.inf and math.isfinite(linear) and math.isfinite(angular)):
             return False
         self.linear, self.angular = linear, angular
         half = angular * self._separation / 2.0
@@ -159,16 +159,16 @@ class Odometry:
         return True
 
     def twist_variances(self, span: float) -> tuple[float, float]:
-        """Return the variances of the linear and angular velocity, averaged over a span [s]."""
+        """Return the variances of linear and angular velocity averaged over ``span`` seconds."""
         half = self.angular * self._separation / 2.0
         rolled = self._travel_noise * (abs(self.linear - half) + abs(self.linear + half)) / span
         skidded = self._turn_noise * abs(self.angular) / span
         return rolled / 4.0, rolled / self._separation**2 + skidded
 
     def _integrate(self, left: float, right: float) -> None:
-        """Move along an arc of the given lengths of both sides [m]."""
+        """Move along an arc, given the travel of both sides [m]."""
         travel, turn = (left + right) / 2.0, (right - left) / self._separation
-        self._spread(left, right, travel, turn)
+        self._advance_covariance(left, right, travel, turn)
         heading = self.heading + turn
         if abs(turn) < 1e-6:
             middle = self.heading + turn / 2.0
@@ -180,7 +180,7 @@ class Odometry:
             self.y -= radius * (math.cos(heading) - math.cos(self.heading))
         self.heading = heading
 
-    def _spread(self, left: float, right: float, travel: float, turn: float) -> None:
+    def _advance_covariance(self, left: float, right: float, travel: float, turn: float) -> None:
         """Advance the covariance: ``P = F P F' + G Q G'`` with inputs (travel, turn)."""
         k, b = self._travel_noise, self._separation
         rolled, uneven = k * (abs(left) + abs(right)), k * (abs(right) - abs(left))

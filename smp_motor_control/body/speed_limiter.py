@@ -1,4 +1,5 @@
-"""Limits of a body's speed, acceleration and jerk, as ros2_controllers computes them."""
+# SPDX-License-Identifier: Apache-2.0
+"""Limits of speed, acceleration and jerk, computed as in ros2_controllers."""
 
 import math
 import sys
@@ -9,11 +10,11 @@ from smp_motor_control.errors import ParameterError
 from smp_motor_control.fields import described
 
 
-class Limited(NamedTuple):
+class LimitedSpeed(NamedTuple):
     """A limited command."""
 
-    value: float  # what may be commanded, in the unit of the command
-    factor: float  # its share of what was asked; 1 where nothing was asked
+    value: float  # the limited value, in the unit of the command
+    factor: float  # limited over requested value; 1 for a request of 0
 
 
 def _clamp(value: float, lower: float, upper: float) -> float:
@@ -22,16 +23,16 @@ def _clamp(value: float, lower: float, upper: float) -> float:
 
 @dataclass(eq=False)
 class SpeedLimiter:
-    """Limits of a speed, its acceleration and its jerk; NaN or None is no limit.
+    """Limit a speed, its acceleration and its jerk; NaN or None means no limit.
 
-    Each maximum switches its pair on; a minimum that is not given is the negative maximum, and
-    limits for slowing down that are not given are those for speeding up.  Accelerations in reverse
-    and decelerations forward are negative, as in diff_drive_controller.
+    A maximum enables its limit; the minimum defaults to the negative maximum, and the limits of
+    deceleration to those of acceleration.  Signs are those of diff_drive_controller: acceleration
+    in reverse and deceleration from forward are negative.
 
     Raises
     ------
     ParameterError
-        When a pair does not enclose zero: a body with such limits cannot be stopped.
+        When a pair does not enclose zero, so that the body could not be stopped.
 
     References
     ----------
@@ -44,77 +45,77 @@ class SpeedLimiter:
     """
 
     min_velocity: float | None = described(
-        math.nan, "Lowest velocity; NaN takes the negative of max_velocity."
+        math.nan, "Minimum velocity; NaN: the negative of max_velocity."
     )
     max_velocity: float | None = described(
-        math.nan, "Highest velocity [m/s] or [rad/s]; NaN for no limit."
+        math.nan, "Maximum velocity [m/s] or [rad/s]; NaN: no limit."
     )
     max_acceleration_reverse: float | None = described(
-        math.nan, "Speeding up in reverse, not positive; NaN as forward."
+        math.nan, "Acceleration in reverse, not positive; NaN: as forward."
     )
     max_acceleration: float | None = described(
-        math.nan, "Speeding up forward [m/s^2] or [rad/s^2]; NaN for no limit."
+        math.nan, "Acceleration forward [m/s^2] or [rad/s^2]; NaN: no limit."
     )
     max_deceleration: float | None = described(
-        math.nan, "Slowing down from forward, not positive; NaN as speeding up."
+        math.nan, "Deceleration from forward, not positive; NaN: as acceleration."
     )
     max_deceleration_reverse: float | None = described(
-        math.nan, "Slowing down from reverse, not negative; NaN as speeding up."
+        math.nan, "Deceleration from reverse, not negative; NaN: as acceleration."
     )
-    min_jerk: float | None = described(math.nan, "Lowest jerk; NaN takes the negative of max_jerk.")
+    min_jerk: float | None = described(math.nan, "Minimum jerk; NaN: the negative of max_jerk.")
     max_jerk: float | None = described(
-        math.nan, "Highest jerk [m/s^3] or [rad/s^3]; NaN for no limit."
+        math.nan, "Maximum jerk [m/s^3] or [rad/s^3]; NaN: no limit."
     )
 
     def __post_init__(self) -> None:
-        self._velocity = _pair("velocity", self.min_velocity, self.max_velocity)
-        self._jerk = _pair("jerk", self.min_jerk, self.max_jerk)
-        self._speeding = self._slowing = _pair(
+        self._velocity = _limit_pair("velocity", self.min_velocity, self.max_velocity)
+        self._jerk = _limit_pair("jerk", self.min_jerk, self.max_jerk)
+        self._speeding = self._slowing = _limit_pair(
             "acceleration", self.max_acceleration_reverse, self.max_acceleration
         )
         if self._speeding is not None:
             falling, rising = self.max_deceleration, self.max_deceleration_reverse
-            self._slowing = _pair(
+            self._slowing = _limit_pair(
                 "acceleration while slowing down",
-                self._speeding[0] if _absent(falling) else falling,
-                self._speeding[1] if _absent(rising) else rising,
+                self._speeding[0] if _is_unset(falling) else falling,
+                self._speeding[1] if _is_unset(rising) else rising,
             )
 
-    def limit(self, v: float, v0: float, v1: float, dt: float) -> Limited:
-        """Limit a speed by jerk, then acceleration, then velocity, after its last two."""
+    def limit(self, v: float, v0: float, v1: float, dt: float) -> LimitedSpeed:
+        """Limit a speed by jerk, then acceleration, then velocity, given its last two values."""
         value = self.limit_jerk(v, v0, v1, dt).value
         value = self.limit_acceleration(value, v0, dt).value
-        return _share(self.limit_velocity(value).value, v)
+        return _limited(self.limit_velocity(value).value, v)
 
-    def limit_velocity(self, v: float) -> Limited:
-        """Apply the limits of the velocity alone."""
+    def limit_velocity(self, v: float) -> LimitedSpeed:
+        """Limit the velocity only."""
         _require_finite(v)
-        return _share(v if self._velocity is None else _clamp(v, *self._velocity), v)
+        return _limited(v if self._velocity is None else _clamp(v, *self._velocity), v)
 
-    def limit_acceleration(self, v: float, v0: float, dt: float) -> Limited:
-        """Apply the limits of the acceleration alone."""
+    def limit_acceleration(self, v: float, v0: float, dt: float) -> LimitedSpeed:
+        """Limit the acceleration only."""
         _require_finite(v, v0, dt)
         if self._speeding is None or self._slowing is None:
-            return _share(v, v)
+            return _limited(v, v)
         falling = self._slowing[0] if v0 > 0.0 else self._speeding[0]
         rising = self._slowing[1] if v0 < 0.0 else self._speeding[1]
-        return _share(v0 + _clamp(v - v0, falling * dt, rising * dt), v)
+        return _limited(v0 + _clamp(v - v0, falling * dt, rising * dt), v)
 
-    def limit_jerk(self, v: float, v0: float, v1: float, dt: float) -> Limited:
-        """Apply the limits of the jerk alone, and not while easing off."""
+    def limit_jerk(self, v: float, v0: float, v1: float, dt: float) -> LimitedSpeed:
+        """Limit the jerk only, except while the acceleration decreases."""
         _require_finite(v, v0, dt, v1)
         change, before = v - v0, v0 - v1
         if self._jerk is None or (change - before) * change <= 0.0:
-            return _share(v, v)
+            return _limited(v, v)
         lower, upper = (bound * dt * dt for bound in self._jerk)
-        return _share(v0 + before + _clamp(change - before, lower, upper), v)
+        return _limited(v0 + before + _clamp(change - before, lower, upper), v)
 
 
-def _absent(limit: float | None) -> bool:
+def _is_unset(limit: float | None) -> bool:
     return limit is None or math.isnan(limit)
 
 
-def _pair(name: str, lower: float | None, upper: float | None) -> tuple[float, float] | None:
+def _limit_pair(name: str, lower: float | None, upper: float | None) -> tuple[float, float] | None:
     """Return both limits, or None where the upper one is not given."""
     if upper is None or math.isnan(upper):
         return None
@@ -129,8 +130,8 @@ def _pair(name: str, lower: float | None, upper: float | None) -> tuple[float, f
     return max(lower, -sys.float_info.max), min(upper, sys.float_info.max)
 
 
-def _share(value: float, asked: float) -> Limited:
-    return Limited(value, value / asked if asked != 0.0 else 1.0)
+def _limited(value: float, requested: float) -> LimitedSpeed:
+    return LimitedSpeed(value, value / requested if requested != 0.0 else 1.0)
 
 
 def _require_finite(v: float, v0: float = 0.0, dt: float = 0.0, v1: float = 0.0) -> None:

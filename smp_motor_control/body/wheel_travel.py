@@ -1,23 +1,24 @@
-"""How far the wheels have turned since last asked, from samples that may be lost or wrong."""
+# SPDX-License-Identifier: Apache-2.0
+"""Wheel travel from samples that may be lost or wrong."""
 
 import math
 from collections import deque
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
-LONGEST_GUESS = 0.1
-"""For so long [s] a wheel without a position is taken to have kept its velocity."""
+MAX_EXTRAPOLATION_S = 0.1
+"""Longest interval over which a velocity is extrapolated where the position is missing."""
 
-JITTER = 0.02
-"""By so much stamps may be off [s], beside what a count adds to the angle of a short interval."""
+STAMP_JITTER_S = 0.02
+"""Tolerated error of a stamp, including the angle of one count over a short interval."""
 
-CLOCK_JUMP = 1.0
-"""Stamps that go back by more are of a clock that was set; by less they are late ones [s]."""
+CLOCK_JUMP_S = 1.0
+"""A stamp that goes back by more shows a clock that was set; by less, a late sample."""
 
-UNFILLED = 1.0
-"""Angle by the velocity [rad] over which a position that never changes is not the wheel's."""
+UNFILLED_ANGLE = 1.0
+"""Integrated velocity [rad] after which a constant position counts as not filled in."""
 
-TURN = 2.0 * math.pi
+REVOLUTION = 2.0 * math.pi
 
 
 class WheelSample(NamedTuple):
@@ -30,93 +31,98 @@ class WheelSample(NamedTuple):
 
 
 class SideTravel(NamedTuple):
-    """How far the wheels of both sides turned, and how fast they turn."""
+    """Travel and speed of both sides."""
 
-    # left, right: mean over the side's wheels since it was last asked for [rad]
+    # left, right: mean over the side's wheels since the previous call [rad]
     left: float
     right: float
-    # left_speed, right_speed: mean over the side's wheels [rad/s]; of each its travel over a
-    # window, over the time between the stamps of the window's ends
+    # left_speed, right_speed: mean over the side's wheels of the speed over a window [rad/s]
     left_speed: float
     right_speed: float
 
 
 class WheelTravel:
-    """How far one wheel has turned since its first sample, by position or else by velocity.
+    """Travel of one wheel since its first sample, from position or, without one, velocity.
 
-    A position that jumps is left out, unless the next one is there, too: then its counter was
-    reset.  One that goes back by a turn wraps, and one that never changes was not filled.
+    A jump of the position is ignored unless the next sample confirms it, which shows a counter
+    reset.  A jump by one revolution is a wrap; a position that never changes was not filled in.
 
     Attributes
     ----------
     angle : float
-        Way since the first sample [rad].
+        Travel since the first sample [rad].
     latest : WheelSample
-        The newest sample that is believed.
+        The newest accepted sample.
     jumps, wraps : int
-        How often the position began anew, and wrapped.
+        Number of resets and of wraps of the position.
     """
 
     def __init__(self, first: WheelSample, angle: float = 0.0) -> None:
         self.latest, self.angle = first, angle
         self.jumps = self.wraps = 0
-        self._doubted: WheelSample | None = None
-        self._unmoved: float | None = 0.0  # by the velocity, while the position stays [rad]
+        self._suspect: WheelSample | None = None
+        self._unmoved: float | None = 0.0  # integrated velocity at constant position [rad]
         self._past: deque[WheelSample] = deque([first])
 
     @property
     def problem(self) -> str:
-        """What is wrong with the position, and what to do about it; empty where nothing is."""
+        """Fault of the position and its remedy; empty without a fault."""
         if self._is_unfilled():
-            return "position never changes while velocity does: the driver must fill it in"
+            return "position never changes while the wheel turns: the driver must fill it in"
         if self.wraps:
-            return f"position wraps ({self.wraps} times): the driver must let it go on"
+            return f"position wraps ({self.wraps} times): the driver must unwrap it"
         if self.jumps:
-            return f"position jumped {self.jumps} times: counter reset, or a second publisher"
+            return (
+                f"position jumped {self.jumps} times: look for counter resets or a second publisher"
+            )
         return ""
 
     def restart(self, sample: WheelSample) -> None:
-        """Go on from a sample of another counter, without motion."""
-        self.latest, self._doubted = sample, None
+        """Continue from a sample of another counter, without travel."""
+        self.latest, self._suspect = sample, None
         self._past = deque([sample])
 
     def add(self, sample: WheelSample, max_speed: float) -> bool:
-        """Take in a sample; return whether it tells how the wheel turned.
+        """Add a sample; return whether it was accepted.
 
-        What needs a wheel faster than ``max_speed`` [rad/s] is a jump.
+        A change faster than ``max_speed`` [rad/s] is a jump.
         """
         last = self.latest
         dt = sample.stamp - last.stamp
-        if dt < -CLOCK_JUMP:
+        if dt < -CLOCK_JUMP_S:
             self.restart(sample)
         if dt <= 0.0:
             return False
-        guess = sample.velocity * min(dt, LONGEST_GUESS) if math.isfinite(sample.velocity) else 0.0
+        extrapolated = (
+            sample.velocity * min(dt, MAX_EXTRAPOLATION_S)
+            if math.isfinite(sample.velocity)
+            else 0.0
+        )
         moved = sample.position - last.position
         if math.isfinite(moved):
-            self._look_for_motion(moved, guess)
+            self._check_position_moves(moved, extrapolated)
         if not math.isfinite(moved) or self._is_unfilled():
-            moved = guess
-        allowed = max_speed * (dt + JITTER)
+            moved = extrapolated
+        allowed = max_speed * (dt + STAMP_JITTER_S)
         if abs(moved) > allowed:
-            unwrapped = moved - math.copysign(TURN, moved)
-            if abs(unwrapped) <= allowed and abs(moved) <= TURN + allowed:
+            unwrapped = moved - math.copysign(REVOLUTION, moved)
+            if abs(unwrapped) <= allowed and abs(moved) <= REVOLUTION + allowed:
                 self.wraps += 1
             elif self._is_confirmed(sample, max_speed):
-                unwrapped = guess
+                unwrapped = extrapolated
                 self.jumps += 1
             else:
-                self._doubted = sample
+                self._suspect = sample
                 return False
             moved = unwrapped
             self._past.clear()
-        self._doubted, self.latest = None, sample
+        self._suspect, self.latest = None, sample
         self.angle += moved
         self._past.append(sample)
         return True
 
     def speed(self, window: float) -> float:
-        """Return the mean speed since the last sample that is a window old, or the oldest."""
+        """Return the mean speed over the last ``window`` seconds, or since the oldest sample."""
         past, latest = self._past, self.latest
         while len(past) > 1 and past[1].stamp <= latest.stamp - window:
             past.popleft()
@@ -125,49 +131,47 @@ class WheelTravel:
         return angle / span if known else latest.velocity
 
     def forget_speed(self) -> None:
-        """Begin the window of the speed anew, as after a silence."""
+        """Restart the averaging window, as after a silence."""
         self._past = deque([self.latest])
 
     def _is_unfilled(self) -> bool:
-        return self._unmoved is not None and abs(self._unmoved) > UNFILLED
+        return self._unmoved is not None and abs(self._unmoved) > UNFILLED_ANGLE
 
-    def _look_for_motion(self, moved: float, guess: float) -> None:
-        """Add up what a position that never changed should have moved by."""
+    def _check_position_moves(self, moved: float, extrapolated: float) -> None:
+        """Integrate the velocity while the position is constant."""
         if moved != 0.0:
             self._unmoved = None
         elif self._unmoved is not None:
             before = self._is_unfilled()
-            self._unmoved += guess
+            self._unmoved += extrapolated
             if self._is_unfilled() and not before:
-                self.angle += self._unmoved - guess  # of this sample the caller adds
+                self.angle += self._unmoved - extrapolated  # the caller adds this sample
 
     def _is_confirmed(self, sample: WheelSample, max_speed: float) -> bool:
-        doubted = self._doubted
+        doubted = self._suspect
         if doubted is None or sample.stamp <= doubted.stamp:
             return False
-        allowed = max_speed * (sample.stamp - doubted.stamp + JITTER)
+        allowed = max_speed * (sample.stamp - doubted.stamp + STAMP_JITTER_S)
         return abs(sample.position - doubted.position) <= allowed
 
 
 class _Wheel:
-    """What is known of one wheel of a side."""
+    """State of one wheel of a side."""
 
     def __init__(self) -> None:
         self.travel: WheelTravel | None = None
         self.arrived = -math.inf
-        self.heard = False  # since last taken
-        self.taken = self.guess = 0.0  # angle when last taken, and with the others of its side
+        self.heard = False  # since the previous call of take
+        # Angle at that call, and the same moved with its side while silent
+        self.taken = self.extrapolated = 0.0
 
     def angle(self, *, silent: bool) -> float:
-        """Return the way since the first sample [rad], guessed while it is silent."""
-        return self.guess if silent or self.travel is None else self.travel.angle
+        """Return the travel since the first sample [rad], extrapolated while silent."""
+        return self.extrapolated if silent or self.travel is None else self.travel.angle
 
 
 class WheelFeedback:
-    """What came of each wheel since it was last taken.
-
-    Speeds are averaged over ``window`` [s].
-    """
+    """Collect the feedback of all wheels; average speeds over ``window`` seconds."""
 
     def __init__(
         self,
@@ -179,24 +183,24 @@ class WheelFeedback:
         self.left, self.right, self.max_speed = tuple(left), tuple(right), max_speed
         self.window = window
         self._wheels = {wheel: _Wheel() for wheel in (*self.left, *self.right)}
-        self._totals = [0.0, 0.0]  # of the sides, when last taken
+        self._totals = [0.0, 0.0]  # travel of the sides at the previous call of take
 
     def receive(
         self, wheel: str, sample: WheelSample, steady_now: float, restarted: bool = False
     ) -> None:
-        """Take in a sample; one that is not finite in position and velocity says nothing.
+        """Add a sample, ignoring one without a finite number.
 
-        A publisher that ``restarted`` counts from elsewhere.
+        The position of a ``restarted`` publisher has a new origin.
         """
         if not (math.isfinite(sample.position) or math.isfinite(sample.velocity)):
             return
         known = self._wheels[wheel]
         if known.travel is None:
-            known.travel = WheelTravel(sample, known.guess)
-            known.taken, known.arrived = known.guess, steady_now
+            known.travel = WheelTravel(sample, known.extrapolated)
+            known.taken, known.arrived = known.extrapolated, steady_now
             return
         if sample.stamp == known.travel.latest.stamp:
-            return  # a duplicate is no sign of life
+            return  # a duplicate does not show that the wheel is alive
         known.arrived = steady_now
         if restarted:
             known.travel.restart(sample)
@@ -204,27 +208,26 @@ class WheelFeedback:
             known.heard = True
 
     def silent(self, steady_now: float, timeout: float) -> dict[str, float]:
-        """Return the wheels that have not been heard for too long."""
+        """Return the silence [s] of each wheel that exceeds the time-out."""
         ages = {wheel: steady_now - known.arrived for wheel, known in self._wheels.items()}
         return {wheel: age for wheel, age in ages.items() if age > timeout}
 
     @property
     def latest(self) -> Mapping[str, WheelSample]:
-        """The newest sample of every wheel that was ever heard."""
+        """The newest sample of every wheel heard so far."""
         return {w: k.travel.latest for w, k in self._wheels.items() if k.travel is not None}
 
     @property
     def problems(self) -> dict[str, str]:
-        """What is wrong with the positions of wheels, and what to do about it."""
-        told = {w: k.travel.problem for w, k in self._wheels.items() if k.travel is not None}
-        return {wheel: problem for wheel, problem in told.items() if problem}
+        """Faults of the wheels' positions and their remedies."""
+        found = {w: k.travel.problem for w, k in self._wheels.items() if k.travel is not None}
+        return {wheel: problem for wheel, problem in found.items() if problem}
 
     def take(self, steady_now: float, timeout: float) -> SideTravel | None:
-        """Return how far the sides turned since the last time that both told it.
+        """Return both sides' travel since the previous result; None while a side is silent.
 
-        A wheel that is silent for longer than the time-out is taken to turn as the others of its
-        side; what its position tells when it is back makes that good.  While a whole side is
-        silent nothing is told, and nothing lost.
+        A silent wheel is assumed to turn like the others of its side; its position corrects this
+        when it returns.
         """
         silent = self.silent(steady_now, timeout)
         for wheel in silent:
@@ -235,7 +238,7 @@ class WheelFeedback:
         if not all(alive) or not any(known.heard for side in alive for known in side):
             return None
         for side, living in zip(sides, alive):
-            _guess(side, living)
+            _extrapolate_silent(side, living)
         totals = [
             sum(self._wheels[w].angle(silent=w in silent) for w in side) / len(side)
             for side in (self.left, self.right)
@@ -249,14 +252,14 @@ class WheelFeedback:
         return SideTravel(left, right, *speeds)
 
 
-def _guess(side: Sequence[_Wheel], living: Sequence[_Wheel]) -> None:
-    """Let wheels that were not heard since last taken turn as the other ones of their side did."""
+def _extrapolate_silent(side: Sequence[_Wheel], living: Sequence[_Wheel]) -> None:
+    """Move wheels without a new sample by the mean of the others of their side."""
     moved = {id(known): known.angle(silent=False) - known.taken for known in living}
     for known in side:
         others = [way for key, way in moved.items() if key != id(known)]
         if known.heard:
-            known.guess = known.angle(silent=False)
+            known.extrapolated = known.angle(silent=False)
         elif others:
-            known.guess += sum(others) / len(others)
+            known.extrapolated += sum(others) / len(others)
     for known in side:
         known.taken, known.heard = known.angle(silent=False), False

@@ -1,4 +1,5 @@
-"""The DC motor: what it is, how it answers, and how its hardware shows it."""
+# SPDX-License-Identifier: Apache-2.0
+"""The DC motor: parameters, response and simulated hardware."""
 
 from smp_motor_control.motor.friction import Motor
 from smp_motor_control.motor.parameters import Gearbox, MotorParameters

@@ -1,4 +1,5 @@
-"""Motors as a ROS parameter file: what the plant simulates and the tools start from.
+# SPDX-License-Identifier: Apache-2.0
+"""Motors in a ROS parameter file.
 
 ::
 
@@ -30,26 +31,26 @@ from smp_motor_control.motor.parameters import (
 )
 from smp_motor_control.parameter_file import read_parameters
 
-HARDWARE = {
+HARDWARE_DEFAULTS = {
     "gear_ratio": 1.0,
     "counts_per_revolution": 500.0,
     "encoder_bits": 0,
     "supply_voltage": 12.0,
     "delay": 0.0,
 }
-"""What may stand beside the motor's parameters, and what holds where it does not."""
+"""Optional keys next to the motor's parameters, with their defaults."""
 
 _OPTIONAL = ("coulomb_friction", "time_constant_product", "static_voltage")
 
 
 @dataclass(frozen=True)
 class Wiring:
-    """What may be wrong between a motor and its driver, for simulations."""
+    """Wiring faults between a motor and its driver, for simulations."""
 
-    leads: int = 1  # -1 where the motor's leads are swapped
-    encoder: int = 1  # -1 where the encoder's channels are
-    dead_zone: float = 0.0  # commands up to so much give nothing [V]
-    described_gear_ratio: float = 0.0  # what the description says of the gearbox; 0: the truth
+    leads: int = 1  # -1: swapped
+    encoder: int = 1  # -1: channels swapped
+    dead_zone: float = 0.0  # commands up to this give 0 V [V]
+    described_gear_ratio: float = 0.0  # published ratio; 0: the true one
 
     def __post_init__(self) -> None:
         for name in ("leads", "encoder"):
@@ -61,36 +62,36 @@ class Wiring:
             check_positive(name, getattr(self, name), or_zero=True)
 
 
-FAULTS = tuple(field.name for field in fields(Wiring))
+WIRING_KEYS = tuple(field.name for field in fields(Wiring))
 
 
 @dataclass(frozen=True)
 class MotorEntry:
-    """One motor of a file, with what is around it."""
+    """One motor of a file with its gearbox, encoder and supply."""
 
     parameters: MotorParameters  # at the motor shaft
     gearbox: Gearbox  # between motor and wheel
     encoder: Encoder  # on the motor shaft
     supply_voltage: float  # [V]
-    delay: float = 0.0  # from a commanded voltage to its effect [s]
-    # As the file gives it [ohm]; NaN where it gives combinations alone, and then neither currents
-    # nor torques of ``parameters`` mean anything
+    delay: float = 0.0  # from command to effect [s]
+    # As given by the file [ohm]; NaN for a file with combinations only, for which the currents and
+    # torques of ``parameters`` are meaningless
     resistance: float = math.nan
-    wiring: Wiring = Wiring()  # what is wrong with it, where it is simulated
+    wiring: Wiring = Wiring()
 
     @property
     def knows_current(self) -> bool:
-        """Whether the current follows from the parameters."""
+        """Whether the parameters determine the current."""
         return not math.isnan(self.resistance)
 
 
-def paper_motors() -> Path:
-    """Return the file of the paper's motors."""
-    return shared("motors_paper.yaml")
+def find_paper_motors() -> Path:
+    """Return the path of the paper's motors."""
+    return find_config("motors_paper.yaml")
 
 
-def shared(name: str) -> Path:
-    """Return a file of ``config``, from the installation or from the sources."""
+def find_config(name: str) -> Path:
+    """Return the path of a file in ``config``, installed or in the sources."""
     prefixes = os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep)
     shares = [Path(prefix, "share", "smp_motor_control") for prefix in prefixes if prefix]
     for place in (*shares, Path(__file__).resolve().parents[2]):
@@ -100,23 +101,23 @@ def shared(name: str) -> Path:
 
 
 def load_motors(path: str | Path, wheels: Iterable[str] | None = None) -> dict[str, MotorEntry]:
-    """Read the motors of a ROS parameter file: those of the first node that has some."""
+    """Read the motors of the first node that has some in a ROS parameter file."""
     for parameters in read_parameters(path).values():
-        if motors := motors_among(parameters):
+        if motors := extract_motors(parameters):
             return parse_motors(motors, str(path), wheels)
     raise ParameterError(
         f"{path}: has no motors; expected NODE: ros__parameters: motors: front_left: ..."
     )
 
 
-def motors_among(parameters: Mapping[str, Any]) -> dict[str, Any]:
-    """Return what the parameters of a node say of motors, by their names."""
+def extract_motors(parameters: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the motors in the parameters of a node, by wheel."""
     start = "motors."
     return nest({n.removeprefix(start): v for n, v in parameters.items() if n.startswith(start)})
 
 
 def nest(dotted: Mapping[str, Any]) -> dict[str, Any]:
-    """Return nested mappings of keys with dots, as ROS names parameters."""
+    """Return nested mappings from ROS parameter names with dots."""
     top: dict[str, Any] = {}
     for key, value in dotted.items():
         *way, last = key.split(".")
@@ -131,8 +132,8 @@ def nest(dotted: Mapping[str, Any]) -> dict[str, Any]:
 def parse_motors(
     motors: Mapping[str, Any], source: str, wheels: Iterable[str] | None = None
 ) -> dict[str, MotorEntry]:
-    """Return the motors of an already nested mapping."""
-    entries = {str(name): _entry(motors[name], f"{source}: {name}") for name in motors}
+    """Return the motors of a nested mapping."""
+    entries = {str(name): _parse_entry(motors[name], f"{source}: {name}") for name in motors}
     try:
         check_wheel_names(list(entries))
     except ParameterError as error:
@@ -146,28 +147,28 @@ def parse_motors(
     return entries
 
 
-def _entry(values: Any, where: str) -> MotorEntry:
+def _parse_entry(values: Any, where: str) -> MotorEntry:
     if not isinstance(values, Mapping):
         raise ParameterError(f"{where}: is {values!r}; expected the motor's parameters")
     combined = any(name in values for name in COMBINATIONS)
     names = (*COMBINATIONS, "resistance") if combined else PHYSICAL
-    known = (*names, *HARDWARE, *FAULTS)
+    known = (*names, *HARDWARE_DEFAULTS, *WIRING_KEYS)
     for key in values:
         if key not in known:
             raise ParameterError(f"{where}: unknown key {key!r}; known are {', '.join(known)}")
     for name in names:
         if name not in (*values, *_OPTIONAL) and not (combined and name == "resistance"):
             raise ParameterError(f"{where}: {name} is missing")
-    numbers = {key: _number(value, f"{where}: {key}") for key, value in values.items()}
+    numbers = {key: _parse_number(value, f"{where}: {key}") for key, value in values.items()}
     try:
-        return _motor(combined, numbers)
+        return _build_entry(combined, numbers)
     except ParameterError as error:
         raise ParameterError(f"{where}: {error}") from None
 
 
-def _motor(combined: bool, numbers: dict[str, float]) -> MotorEntry:
-    hardware = {key: numbers.pop(key, default) for key, default in HARDWARE.items()}
-    faults: dict[str, Any] = {key: numbers.pop(key) for key in FAULTS if key in numbers}
+def _build_entry(combined: bool, numbers: dict[str, float]) -> MotorEntry:
+    hardware = {key: numbers.pop(key, default) for key, default in HARDWARE_DEFAULTS.items()}
+    faults: dict[str, Any] = {key: numbers.pop(key) for key in WIRING_KEYS if key in numbers}
     check_supply("supply_voltage", hardware["supply_voltage"])
     check_positive("delay", hardware["delay"], "s", or_zero=True)
     bits = hardware["encoder_bits"]
@@ -182,7 +183,7 @@ def _motor(combined: bool, numbers: dict[str, float]) -> MotorEntry:
     )
 
 
-def _number(value: Any, where: str) -> float:
+def _parse_number(value: Any, where: str) -> float:
     if isinstance(value, bool) or not isinstance(value, (int, float)):
         raise ParameterError(f"{where} is {value!r}; it must be a number")
     try:

@@ -1,13 +1,13 @@
-"""The DC motor with Coulomb friction, integrated exactly over intervals of constant voltage.
+# SPDX-License-Identifier: Apache-2.0
+"""Exact simulation of a DC motor with Coulomb friction under piecewise constant voltage.
 
-Between two switchings of the friction the motor is linear,
+Between two friction events the motor is linear,
 
     L di/dt     = v - R i - K omega
     J domega/dt = K i - b omega - Tc sign(omega) - Tl,
 
-so its response to a constant voltage is known in closed form.  The instants at which the
-rotor stops, sticks, reverses or breaks loose are located inside the step, so the only error
-of a step is rounding, whatever its length.
+with a closed-form response.  Stopping, reversal and break-away are located inside the step, so
+that a step of any length has rounding errors only.
 """
 
 import math
@@ -21,7 +21,7 @@ _MAX_EVENTS_PER_STEP = 100_000
 
 
 class Motor:
-    """A DC motor with its state, stepped exactly over intervals of constant voltage.
+    """DC motor with its state, advanced exactly over intervals of constant voltage.
 
     Parameters
     ----------
@@ -79,7 +79,7 @@ class Motor:
         voltage : float
             Armature voltage [V].
         dt : float
-            Length of the step [s], zero or positive, of any size.
+            Length of the step [s], zero or positive.
         load_torque : float
             Tl [N m] at the motor shaft; positive brakes positive speed.
 
@@ -109,7 +109,7 @@ class Motor:
         for _ in range(_MAX_EVENTS_PER_STEP):
             if remaining <= 0:
                 break
-            if self._sticks(voltage, load_torque):
+            if self._is_stuck(voltage, load_torque):
                 remaining -= self._stick(voltage, load_torque, remaining)
             else:
                 remaining -= self._slip(voltage, load_torque, remaining)
@@ -123,25 +123,25 @@ class Motor:
             found = self._cache[dt] = self._free.after(dt)
         return found
 
-    def _drive(self, voltage: float, load_torque: float) -> float:
+    def _standstill_torque(self, voltage: float, load_torque: float) -> float:
         """Torque on the rotor at standstill, before friction [N m]."""
         if self._free.first_order:
             return self._constant * voltage / self._resistance - load_torque
         return self._constant * self.current - load_torque
 
-    def _sticks(self, voltage: float, load_torque: float) -> bool:
+    def _is_stuck(self, voltage: float, load_torque: float) -> bool:
         if self.speed != 0.0:
             return False
-        drive = self._drive(voltage, load_torque)
+        drive = self._standstill_torque(voltage, load_torque)
         if abs(drive) < self._coulomb:
             return True
         if abs(drive) > self._coulomb or self._free.first_order:
             return abs(drive) <= self._coulomb
-        # Exactly at the limit: it sticks unless the current is about to raise the torque.
+        # Exactly at the limit it sticks unless the current is rising.
         return (voltage - self._resistance * self.current) * drive <= 0
 
     def _stick(self, voltage: float, load_torque: float, dt: float) -> float:
-        """Stay at rest until release or the end of the step; return the time that took."""
+        """Stay at rest until break-away or the end of the step; return the elapsed time."""
         final = voltage / self._resistance
         if self._free.first_order:
             self.current = final
@@ -151,15 +151,17 @@ class Motor:
             limit = (load_torque + math.copysign(self._coulomb, torque)) / self._constant
             release = self._electrical * math.log((final - self.current) / (final - limit))
             if release < dt:
-                # A hair beyond the limit, so that rounding cannot hold the rotor for ever.
+                # Slightly beyond the limit, so that rounding cannot hold the rotor for ever.
                 self.current = limit + math.copysign(4e-16 * abs(limit), torque)
                 return max(release, 0.0)
         self.current = final + (self.current - final) * math.exp(-dt / self._electrical)
         return dt
 
     def _slip(self, voltage: float, load_torque: float, dt: float) -> float:
-        """Turn until standstill or the end of the step; return the time that took."""
-        direction = self.speed if self.speed != 0.0 else self._drive(voltage, load_torque)
+        """Turn until standstill or the end of the step; return the elapsed time."""
+        direction = (
+            self.speed if self.speed != 0.0 else self._standstill_torque(voltage, load_torque)
+        )
         sign = math.copysign(1.0, direction)
         torque = load_torque + sign * self._coulomb
         if self._free.first_order:
@@ -172,8 +174,8 @@ class Motor:
         last_rate = end.g_rate * deviation + end.h_rate * rate
         crosses = sign * last_speed <= 0
         if not crosses and (rate * last_rate < 0 or self._free.frequency * dt > math.pi):
-            crosses = True  # It may have turned round and come back inside the step.
-        stop = self._standstill(sign, final, deviation, rate, dt) if crosses else None
+            crosses = True  # it may have reversed twice inside the step
+        stop = self._find_standstill(sign, final, deviation, rate, dt) if crosses else None
         if stop is None:
             self._move(voltage, torque, dt, end)
             return dt
@@ -181,23 +183,23 @@ class Motor:
         self.speed = 0.0
         return stop
 
-    def _standstill(
+    def _find_standstill(
         self, sign: float, final: float, deviation: float, rate: float, until: float
     ) -> float | None:
-        """Return the first instant at which the speed reaches zero, None if it does not."""
+        """Return the first instant of zero speed; None if the speed keeps its sign."""
         bounds = [*self._free.turning_points(deviation, rate, until), until]
         begin = 0.0
         for end in bounds:
             c = self._free.after(end)
             if sign * (final + c.g * deviation + c.h * rate) <= 0:
-                return self._root(sign, final, deviation, rate, begin, end)
+                return self._find_zero_speed(sign, final, deviation, rate, begin, end)
             begin = end
         return None
 
-    def _root(
+    def _find_zero_speed(
         self, sign: float, final: float, deviation: float, rate: float, begin: float, end: float
     ) -> float:
-        """Locate the zero of the speed in a bracket where it falls from ``sign`` side to 0."""
+        """Locate the zero of the speed inside a bracket."""
         if self._free.first_order:
             return min(max(math.log(-final / deviation) / self._free.slow, begin), end)
         time = end
@@ -220,7 +222,7 @@ class Motor:
         return time
 
     def _move(self, voltage: float, torque: float, dt: float, c: Coefficients) -> None:
-        """Linear motion over ``dt`` against a constant torque."""
+        """Advance the linear motion by ``dt`` against a constant torque."""
         final_speed = (self._constant * voltage - self._resistance * torque) / self._determinant
         deviation = self.speed - final_speed
         if self._free.first_order:

@@ -1,8 +1,8 @@
-"""A driven motor as its hardware shows it: supply, PWM, delay, time-out, encoder and sensors.
+# SPDX-License-Identifier: Apache-2.0
+"""Simulated motor hardware: supply, PWM, delay, time-out, encoder and sensors.
 
-Time comes in as an argument, in seconds on a clock that only goes forward.  Commands take
-effect when they arrive or, latched, at the next sample; a sample integrates over what really
-happened since the one before.
+Time is an argument, in seconds on a monotonic clock.  Commands take effect on arrival or,
+latched, at the next sample.
 """
 
 import math
@@ -19,39 +19,39 @@ from smp_motor_control.motor.friction import Motor
 
 
 class Sample(NamedTuple):
-    """What the hardware reports at one instant; fields as in ``MotorState``."""
+    """Reported state; fields as in ``MotorState``."""
 
-    voltage: float  # mean armature voltage since the sample before [V]
-    current: float  # [A]; NaN where it is not measured
+    voltage: float  # mean armature voltage since the previous sample [V]
+    current: float  # [A]; NaN if not measured
     # velocity, position: of the wheel, from counts [rad/s], [rad]
     velocity: float
     position: float
-    encoder_count: int  # of the encoder at the motor shaft, as the counter shows it
-    duty: float  # duty cycle in force [-1..1]
+    encoder_count: int  # raw reading at the motor shaft
+    duty: float  # duty cycle [-1..1]
 
 
 @dataclass(frozen=True, kw_only=True)
 class DriveSettings:
-    """What is between a command and a motor, and between a motor and its report."""
+    """Properties of the driver and the sensors."""
 
-    pwm_steps: int = described(0, "Steps of the duty cycle from 0 to 1; 0 for a continuous one.")
+    pwm_steps: int = described(0, "Steps of the duty cycle from 0 to 1; 0: continuous.")
     command_timeout: float = described(
-        0.2, "Time after the last command at which the voltage goes to zero [s]."
+        0.2, "Time after the last command until the voltage is set to zero [s]."
     )
     current_sensor: bool = described(
-        True, "Whether the current is measured; reported as NaN where not."
+        True, "Whether the current is measured; NaN is reported otherwise."
     )
     current_noise: float = described(0.0, "Standard deviation of the measured current [A].")
-    # Over an interval of dt its mean has the standard deviation ``torque_noise / sqrt(dt)``.
+    # The standard deviation of its mean over dt is ``torque_noise / sqrt(dt)``.
     torque_noise: float = described(
-        0.0, "Intensity of a random load at the motor shaft [N m sqrt(s)]."
+        0.0, "Intensity of a white load torque at the motor shaft [N m sqrt(s)]."
     )
-    # Every reported voltage is then constant over its interval.
+    # A reported voltage is then constant over its interval.
     latch: bool = described(
-        False, "Whether commands wait for the next sample, as in firmware with a fixed rate."
+        False, "Whether commands take effect at the next sample, as in fixed-rate firmware."
     )
     velocity_window: int = described(
-        1, "Samples that the reported speed is differenced over; 0 for the true one."
+        1, "Number of samples over which the reported speed is differenced; 0: the true speed."
     )
 
     def __post_init__(self) -> None:
@@ -61,15 +61,15 @@ class DriveSettings:
 
 
 class Supply:
-    """A battery with an inner resistance that several motors share."""
+    """Battery with an internal resistance, shared by several motors."""
 
     def __init__(self, voltage: float, resistance: float = 0.0) -> None:
-        self.open_voltage = voltage  # without load [V]
-        self.resistance = resistance  # inner one [ohm]; 0 for a stiff supply
+        self.open_voltage = voltage  # [V]
+        self.resistance = resistance  # [ohm]
         self.motors: list[DrivenMotor] = []
 
     def terminal_voltage(self) -> float:
-        """Return the voltage under the present currents [V], never below zero."""
+        """Return the voltage at the present currents [V], never below zero."""
         if self.resistance == 0.0:
             return self.open_voltage
         drawn = sum(m.duty * m.entry.wiring.leads * m.motor.current for m in self.motors)
@@ -77,9 +77,9 @@ class Supply:
 
 
 class DrivenMotor:
-    """One motor with its driver, gearbox, encoder and sensors, from an instant [s] on.
+    """One motor with its driver, gearbox, encoder and sensors, from the instant ``start`` [s] on.
 
-    It shares a supply with other motors, or has a stiff one of its own.
+    Without a ``supply`` to share it has a stiff one of its own.
     """
 
     def __init__(
@@ -95,7 +95,7 @@ class DrivenMotor:
         self.supply = supply or Supply(entry.supply_voltage)
         self.supply.motors.append(self)
         self.motor = Motor(entry.parameters)  # the true state
-        self.duty = 0.0  # in force
+        self.duty = 0.0
         self.timed_out = True  # whether the last command has expired
         self._random = random.Random(seed)
         self._speed = DifferencedSpeed(entry.encoder, max(1, settings.velocity_window))
@@ -110,7 +110,7 @@ class DrivenMotor:
         self._last_velocity = 0.0
 
     def command(self, time: float, voltage: float) -> bool:
-        """Take a command; what is not finite counts as 0 V."""
+        """Command a voltage [V]; a non-finite one counts as 0 V and returns False."""
         finite = math.isfinite(voltage)
         if self.settings.latch:
             self._latched = voltage if finite else 0.0
@@ -119,7 +119,7 @@ class DrivenMotor:
         return finite
 
     def load(self, time: float, wheel_torque: float) -> bool:
-        """Put a load on the wheel from now on; what is not finite is ignored."""
+        """Set the load torque of the wheel [N m]; a non-finite one is ignored and returns False."""
         if not math.isfinite(wheel_torque):
             return False
         self.advance(time)
@@ -127,7 +127,7 @@ class DrivenMotor:
         return True
 
     def advance(self, time: float) -> None:
-        """Integrate up to an instant, through commands and their expiry."""
+        """Simulate up to an instant, through commands and their expiry."""
         while self._now < time:
             until = min(time, self._expiry)
             if self._pending and self._pending[0][0] < until:
@@ -144,7 +144,7 @@ class DrivenMotor:
                 self.timed_out = True
 
     def _set_duty(self, voltage: float) -> None:
-        # The driver knows the nominal voltage; under sag it delivers less than asked.
+        # The driver divides by the nominal voltage; when the supply sags it delivers less.
         if abs(voltage) <= self.entry.wiring.dead_zone:
             voltage = 0.0
         duty = min(max(voltage / self.entry.supply_voltage, -1.0), 1.0)
@@ -164,7 +164,7 @@ class DrivenMotor:
         self._now = until
 
     def sample(self, time: float) -> Sample:
-        """Integrate up to an instant and report what the sensors show there."""
+        """Simulate up to an instant and return the sensors' readings."""
         self.advance(time)
         elapsed = time - self._sampled
         if elapsed > 0:

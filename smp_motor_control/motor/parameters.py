@@ -1,4 +1,5 @@
-"""What a DC motor and its gearbox are: validated numbers, and the one conversion between shafts."""
+# SPDX-License-Identifier: Apache-2.0
+"""Validated parameters of a DC motor and its gearbox."""
 
 from dataclasses import dataclass, fields
 from typing import TypeVar
@@ -15,13 +16,13 @@ _UNITS = {
     "coulomb_friction": "N m",
 }
 PHYSICAL = tuple(_UNITS)
-"""Names of a motor's physical parameters."""
+"""Physical parameters."""
 
 COMBINATIONS = ("dc_gain", "time_constant", "time_constant_product", "static_voltage")
-"""Names of what voltage and speed tell of a motor."""
+"""Parameter combinations that voltage and speed identify."""
 
-SUPPLIES = (0.1, 1000.0)
-"""Supply voltages that a wheel's driver can have [V]."""
+SUPPLY_RANGE_V = (0.1, 1000.0)
+"""Range of supply voltages [V]."""
 
 _MAY_BE_ZERO = ("inductance", "viscous_friction", "coulomb_friction")
 Motion = TypeVar("Motion", float, Array)
@@ -36,20 +37,20 @@ class MotorParameters:
     resistance : float
         Armature resistance R [ohm], positive.
     inductance : float
-        Armature inductance L [H]; 0 leaves the first-order motor.
+        Armature inductance L [H]; 0 gives a first-order motor.
     motor_constant : float
         Torque constant = back-EMF constant K [N m/A = V s/rad], positive.
     inertia : float
-        Inertia J of everything that turns [kg m^2], positive.
+        Total inertia J [kg m^2], positive.
     viscous_friction : float
-        b [N m s/rad].
+        Viscous friction b [N m s/rad].
     coulomb_friction : float
-        Tc [N m]; also the largest torque at which the rotor sticks.
+        Coulomb friction Tc [N m]; also the break-away torque.
 
     Raises
     ------
     ParameterError
-        When a value is not a number that a motor can have.
+        When a value is out of range.
     """
 
     resistance: float
@@ -76,12 +77,11 @@ class MotorParameters:
         static_voltage: float = 0.0,
         resistance: float = 1.0,
     ) -> "MotorParameters":
-        """Return a motor that answers a voltage like the one with these combinations.
+        """Return the motor without viscous friction that has these combinations.
 
-        Voltage and speed do not tell the physical parameters apart; of all motors with the
-        same response this takes the one without viscous friction: ``K = a0``,
-        ``J = a1 K / R``, ``L = a2 R / a1``.  The response is the same while the motor
-        slides; where friction switches, it is if the original has no viscous friction.
+        ``K = a0``, ``J = a1 K / R``, ``L = a2 R / a1``.  While it slides, its response to a voltage
+        is that of every motor with these combinations; voltage and speed cannot separate the
+        physical parameters.
         """
         named = {"dc_gain": dc_gain, "time_constant": time_constant, "resistance": resistance}
         for name, value in named.items():
@@ -119,7 +119,7 @@ class MotorParameters:
 
     @property
     def dc_gain(self) -> float:
-        """Speed per volt in steady state, without Coulomb friction [rad/s/V]."""
+        """Steady speed per volt, without Coulomb friction [rad/s/V]."""
         return 1.0 / self.a0
 
     @property
@@ -134,18 +134,18 @@ class MotorParameters:
 
     @property
     def static_voltage(self) -> float:
-        """Voltage at which the unloaded motor breaks loose, ``R Tc / K`` [V]."""
+        """Voltage at which the unloaded motor breaks away, ``R Tc / K`` [V]."""
         return self.resistance * self.coulomb_friction / self.motor_constant
 
 
 def check_supply(name: str, voltage: float) -> float:
-    """Return a supply voltage that a driver can have: it limits what a motor is given."""
-    return check_range(name, voltage, *SUPPLIES, "V")
+    """Return a supply voltage [V]; raise when it is out of range."""
+    return check_range(name, voltage, *SUPPLY_RANGE_V, "V")
 
 
 @dataclass(frozen=True)
 class Gearbox:
-    """The one place that converts between motor shaft and wheel.
+    """Conversion between motor shaft and wheel.
 
     Examples
     --------
@@ -159,13 +159,13 @@ class Gearbox:
         check_range("gear ratio", self.ratio, 1e-6, 1e6)
 
     def to_motor(self, wheel: Motion) -> Motion:
-        """Return the motor's angle [rad], speed [rad/s] or acceleration of a wheel's."""
+        """Convert an angle [rad], speed [rad/s] or acceleration from wheel to motor."""
         return wheel * self.ratio
 
     def to_wheel(self, motor: Motion) -> Motion:
-        """Return the wheel's angle [rad], speed [rad/s] or acceleration of a motor's."""
+        """Convert an angle [rad], speed [rad/s] or acceleration from motor to wheel."""
         return motor / self.ratio
 
     def torque_to_motor(self, wheel_torque: float) -> float:
-        """Return the torque that a load on the wheel puts on the motor shaft (no losses)."""
+        """Convert a load torque from wheel to motor shaft, without losses."""
         return wheel_torque / self.ratio

@@ -1,7 +1,7 @@
-r"""The exact response of a linear motor, for one motor and for a batch of them.
+# SPDX-License-Identifier: Apache-2.0
+r"""Exact response of a linear motor, for one motor or a batch.
 
-Between two switchings of its friction a motor obeys, with e the deviation of the speed from
-its steady value ``K u``,
+The deviation e of the speed from its steady value ``K u`` obeys
 
     tp e'' + tau e' + e = 0,    tp = time_constant_product,    tau = time_constant.
 
@@ -9,9 +9,9 @@ With the roots ``l1 >= l2`` of ``tp s^2 + tau s + 1``,
 
     e(t) = g e(0) + h e'(0),   h = (e^(l1 t) - e^(l2 t)) / (l1 - l2),   g = e^(l1 t) - l1 h,
 
-written so that nothing cancels or overflows, from a complex pair to a fast root that has
-decayed within any interval of interest.  The equation itself, integrated once, gives the
-angle: ``int e = tau (e(0) - e(t)) + tp (e'(0) - e'(t))``.
+written without cancellation or overflow for complex roots and for arbitrarily fast ones.
+Integrating the equation once gives the angle:
+``int e = tau (e(0) - e(t)) + tp (e'(0) - e'(t))``.
 
 References
 ----------
@@ -27,32 +27,30 @@ from numpy.typing import ArrayLike
 
 from smp_motor_control.arrays import Array
 
-NEGLIGIBLE = 1e-14
-"""``tp / tau^2`` up to which a motor is of first order: its response is the same to 1e-14."""
+MAX_FIRST_ORDER_RATIO = 1e-14
+"""Largest ``tp / tau^2`` of a motor treated as first order; its response differs by 1e-14."""
 
 
 class Coefficients(NamedTuple):
-    """Free response after a time t: ``e(t) = g e(0) + h e'(0)``, and its rate's."""
+    """Coefficients of the free response, ``e(t) = g e(0) + h e'(0)``, and of its rate."""
 
-    # g, h: of the response
     g: float
     h: float
-    # g_rate, h_rate: of its rate
     g_rate: float
     h_rate: float
 
 
 class FreeResponse:
-    """How the speed of one motor decays to its steady value; scalar, for loops that run live.
+    """Free response of one motor; scalar, for real-time loops.
 
-    Of the sum of its time constants [s] and their product [s^2], 0 for a motor of first order, come
-    the real parts ``slow`` and ``fast`` of its roots [1/s] and the ``frequency`` of a complex pair
-    [rad/s], 0 for real roots.
+    Arguments are the sum of the time constants [s] and their product [s^2], 0 for first order.
+    ``slow`` and ``fast`` are the real parts of the roots [1/s], ``frequency`` is the imaginary part
+    of a complex pair [rad/s].
     """
 
     def __init__(self, time_constant: float, product: float) -> None:
         self.time_constant, self.product = time_constant, product
-        self.first_order = product <= NEGLIGIBLE * time_constant * time_constant
+        self.first_order = product <= MAX_FIRST_ORDER_RATIO * time_constant * time_constant
         self.frequency = self.gap = 0.0
         if self.first_order:
             self.product = 0.0
@@ -69,7 +67,7 @@ class FreeResponse:
         self.gap = max(self.slow - self.fast, 0.0)
 
     def after(self, time: float) -> Coefficients:
-        """Return the coefficients of the response after some time [s]."""
+        """Return the coefficients after a time [s]."""
         slow = self.slow
         decay = math.exp(slow * time)
         if self.first_order:
@@ -83,11 +81,11 @@ class FreeResponse:
         return Coefficients(decay - slow * h, h, -h / self.product, h_rate)
 
     def integral(self, fall: float, rate_fall: float) -> float:
-        """Return the integral of a deviation that, with its rate, fell by so much."""
+        """Return the integral of the deviation, given its decrease and that of its rate."""
         return self.time_constant * fall + self.product * rate_fall
 
     def turning_points(self, deviation: float, rate: float, until: float) -> list[float]:
-        """Return the instants before ``until`` at which the response turns round [s]."""
+        """Return the instants before ``until`` at which the rate is zero [s]."""
         if self.first_order or until <= 0.0:
             return []
         if self.frequency > 0.0:
@@ -104,13 +102,13 @@ class FreeResponse:
             if self.gap * ratio <= -1.0:
                 return []
             times = [math.log1p(self.gap * ratio) / self.gap if self.gap > 0.0 else ratio]
-        # The instant of breaking loose is a turning point too, up to rounding: not that one.
+        # Skip the instant of break-away, which is a turning point up to rounding.
         shortest = 1e-12 / abs(self.fast)
         return [t for t in times if shortest < t < until]
 
 
 class HeldResponse(NamedTuple):
-    """A batch of n motors over intervals of constant voltage u, state ``x = (w, w')``.
+    """Discrete model of n motors under constant voltage u, with state ``x = (w, w')``.
 
     ``x <- transition x + forced u`` and ``angle += angle_transition x + angle_forced u``.
     """
@@ -124,10 +122,9 @@ class HeldResponse(NamedTuple):
 def zero_order_hold(
     dc_gain: ArrayLike, time_constant: ArrayLike, product: ArrayLike, interval: ArrayLike
 ) -> HeldResponse:
-    """Return the exact sampled response of a batch of motors, arguments of shape (n,) or ().
+    """Return the exact discrete model of a batch of motors, arguments of shape (n,) or ().
 
-    A product of the time constants [s^2] of 0 is a motor of first order, whose acceleration follows
-    its speed and the voltage.
+    A ``product`` of 0 gives a first-order motor, whose acceleration follows speed and voltage.
 
     Examples
     --------
@@ -148,9 +145,9 @@ def zero_order_hold(
 
 
 def _coefficients(tau: Array, tp: Array, t: Array) -> tuple[Array, Array, Array, Array, Array]:
-    """Return what :meth:`FreeResponse.after` does, of a batch, and the products in force."""
-    first_order = tp <= NEGLIGIBLE * tau * tau
-    product = np.where(first_order, tau * tau, tp)  # any: its results are not taken
+    """Return the coefficients of :meth:`FreeResponse.after` for a batch, and the products used."""
+    first_order = tp <= MAX_FIRST_ORDER_RATIO * tau * tau
+    product = np.where(first_order, tau * tau, tp)  # placeholder where the result is not used
     half = -0.5 * tau / product
     square = half * half - 1.0 / product
     root = np.sqrt(np.abs(square))

@@ -1,1 +1,2 @@
-"""Thin ROS shells: parameters to validated settings, topics to calls of the core."""
+# SPDX-License-Identifier: Apache-2.0
+"""ROS nodes: thin shells around the ROS-free core."""

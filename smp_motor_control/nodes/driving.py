@@ -1,4 +1,5 @@
-"""Drives of the body, or of the wheels past skid_steer, by segments, with zero at the end."""
+# SPDX-License-Identifier: Apache-2.0
+"""Drives in segments of the body, or of the wheels without skid_steer, that end with zero."""
 
 import time
 from collections.abc import Callable, Sequence
@@ -10,21 +11,21 @@ from sensor_msgs.msg import JointState
 
 from smp_interfaces.msg import PidState
 from smp_motor_control import joint_of
-from smp_motor_control.nodes.robot_client import PATIENCE, RobotClient, RobotError
+from smp_motor_control.nodes.robot_client import TIMEOUT_S, RobotClient, RobotError
 from smp_motor_control.nodes.runtime import STREAM_PUBLISHER
 
-REPEAT = 0.02  # interval at which a command is repeated [s]
-STANDSTILL = 1.0  # standstill that is commanded before a drive at least [s]
-QUIET = 0.5  # time in which nobody else may send set-points [s]
+COMMAND_PERIOD_S = 0.02
+STANDSTILL_S = 1.0  # minimum standstill before a drive
+QUIET_TIME_S = 0.5  # time without set-points of other nodes before a drive
 
 Times = list[tuple[str, float, float]]
-"""Name, begin and end of each segment, by the stamps [s]."""
+"""Name, start and end of each segment by the stamps [s]."""
 
 
 def drive_body(
     client: RobotClient, segments: Sequence[tuple[str, float, float, float]], wheels: Sequence[str]
 ) -> Times:
-    """Drive through segments of (name, m/s, rad/s, s), and stop whatever happens."""
+    """Drive segments of (name, m/s, rad/s, s) and stop in any case."""
     publisher = client.node.create_publisher(TwistStamped, "cmd_vel", 1)
 
     def send(linear: float, angular: float) -> None:
@@ -34,15 +35,15 @@ def drive_body(
         message.twist.linear.x, message.twist.angular.z = float(linear), float(angular)
         publisher.publish(message)
 
-    if not client.until(lambda: publisher.get_subscription_count() > 0, PATIENCE):
-        raise RobotError(f"nobody listens on {publisher.topic_name}: start skid_steer")
-    return _drive(client, publisher, send, segments, wheels)
+    if not client.until(lambda: publisher.get_subscription_count() > 0, TIMEOUT_S):
+        raise RobotError(f"{publisher.topic_name} has no subscriber; start skid_steer")
+    return _run_segments(client, publisher, send, segments, wheels)
 
 
 def drive_wheels(
     client: RobotClient, steps: Sequence[tuple[str, float, float]], wheels: Sequence[str]
 ) -> Times:
-    """Drive all wheels through steps of (name, rad/s, s), and stop them whatever happens."""
+    """Drive all wheels through steps of (name, rad/s, s) and stop in any case."""
     _refuse_rivals(client)
     publisher = client.node.create_publisher(JointState, "wheel_setpoints", STREAM_PUBLISHER)
     message = JointState(name=[joint_of(wheel) for wheel in wheels])
@@ -52,51 +53,55 @@ def drive_wheels(
         message.velocity = [float(speed)] * len(wheels)
         publisher.publish(message)
 
-    return _drive(client, publisher, send, steps, wheels)
+    return _run_segments(client, publisher, send, steps, wheels)
 
 
-def _drive(
+def _run_segments(
     client: RobotClient,
     publisher: Publisher,
     send: Callable[..., None],
     segments: Sequence[tuple[Any, ...]],
     wheels: Sequence[str],
 ) -> Times:
-    """Send the values of segments of (name, values ..., s) from a standstill on."""
+    """Send the values of segments (name, values ..., s) after a standstill."""
     zero = [0.0] * (len(segments[0]) - 2)
     times = []
     try:
-        _stand(client, lambda: send(*zero), wheels)
+        _command_standstill(client, lambda: send(*zero), wheels)
         for name, *values, duration in segments:
             begin, end = _now(client), time.monotonic() + duration
             while (left := end - time.monotonic()) > 0:
                 send(*values)
-                client.spin(min(REPEAT, left))
+                client.spin(min(COMMAND_PERIOD_S, left))
             times.append((name, begin, _now(client)))
     finally:
         for _ in range(3):
             send(*zero)
-            client.spin(REPEAT)
+            client.spin(COMMAND_PERIOD_S)
         client.node.destroy_publisher(publisher)
     return times
 
 
-def _stand(client: RobotClient, send_zero: Callable[[], None], wheels: Sequence[str]) -> None:
-    """Command standstill until the wheels hear it: who just joined is still being found."""
+def _command_standstill(
+    client: RobotClient, send_zero: Callable[[], None], wheels: Sequence[str]
+) -> None:
+    """Command standstill until all wheels confirm it; discovery may take a while."""
     heard = dict.fromkeys(wheels, 0.0)
 
     def take(wheel: str, message: PidState) -> None:
         if message.setpoint == 0.0:
             heard[wheel] = time.monotonic()
 
-    followed = time.monotonic() + STANDSTILL
+    followed = time.monotonic() + STANDSTILL_S
     with client.listen_to_wheels(PidState, "pid_state", wheels, take):
         while time.monotonic() < followed or min(heard.values()) < followed:
-            if time.monotonic() > followed + PATIENCE:
+            if time.monotonic() > followed + TIMEOUT_S:
                 silent = [f"{w}/pid_state" for w in wheels if heard[w] < followed]
-                raise RobotError(f"standstill is commanded, but {', '.join(silent)} is silent")
+                raise RobotError(
+                    f"no message on {', '.join(silent)} at standstill; is wheel_pid active?"
+                )
             send_zero()
-            client.spin(REPEAT)
+            client.spin(COMMAND_PERIOD_S)
 
 
 def _now(client: RobotClient) -> float:
@@ -104,12 +109,12 @@ def _now(client: RobotClient) -> float:
 
 
 def _refuse_rivals(client: RobotClient) -> None:
-    """Raise where somebody else drives."""
+    """Raise when another node sends set-points."""
     heard: list[JointState] = []
     with client.listen(JointState, {"wheel_setpoints": heard.append}):
-        client.until(lambda: bool(heard), QUIET)
+        client.until(lambda: bool(heard), QUIET_TIME_S)
     if heard:
         topic = client.node.resolve_topic_name("wheel_setpoints")
         named = client.node.get_publishers_info_by_topic(topic)
-        who = ", ".join(sorted({one.node_name for one in named})) or "somebody"
-        raise RobotError(f"wheel_setpoints: {who} drives the wheels; let it rest first")
+        who = ", ".join(sorted({one.node_name for one in named})) or "another node"
+        raise RobotError(f"wheel_setpoints: {who} drives the wheels; stop it first")

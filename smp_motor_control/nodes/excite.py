@@ -1,9 +1,9 @@
-"""Sends a bounded test voltage to one wheel or to all, for a bounded time, and then zero.
+# SPDX-License-Identifier: Apache-2.0
+"""Sends a bounded test voltage to one or all wheels for a limited time, then zero.
 
-Ends by itself with exit code 0; sends zero to every wheel whatever the reason of leaving.
-A wheel that another node drives is refused: deactivate its controller, or let it rest.
-A wheel that turns too fast, draws too much or is not heard any more ends the signal for
-all, with exit code 1.
+Exits with code 0 at the end and always sends a final zero.  A wheel that another node drives is
+refused: deactivate its controller first.  A wheel that exceeds its speed or current limit, or
+stops reporting, ends the test of all wheels with exit code 1.
 """
 
 import math
@@ -22,18 +22,17 @@ from smp_motor_control.excitation import SIGNALS, Bounded, Excitation
 from smp_motor_control.fields import fixed
 from smp_motor_control.nodes import runtime
 from smp_motor_control.nodes.motor_writer import MotorWriter
-from smp_motor_control.nodes.publishers import PublisherWatch, two_publishers
+from smp_motor_control.nodes.publishers import PublisherWatch, describe_two_publishers
 from smp_motor_control.nodes.settings import Parameters
 from smp_motor_control.wheel.protection import Bounds, Protection
 
-_OTHERS = 0.5  # time [s] that other listeners than the driver are given to connect
-_SILENCE = 1.0
-"""A wheel that was heard is missed after commands of so long [s]; time in which this process did
-not run does not count."""
+_CONNECTION_WAIT_S = 0.5  # for other subscribers than the driver
+_SILENCE_S = 1.0
+"""Silence of a wheel that ends the test, counted in commands: a paused process does not count."""
 
 
 class LimitError(SmpError):
-    """A wheel left what it may reach."""
+    """A wheel exceeded a limit."""
 
     exit_code = 1
 
@@ -42,24 +41,24 @@ class LimitError(SmpError):
 class Settings:
     signal: str = fixed("fourier", f"One of {', '.join(SIGNALS)}.")
     wheel_names: tuple[str, ...] = fixed(WHEELS, "Wheels of the robot.")
-    wheels: tuple[str, ...] = fixed(("all",), "Wheels to excite, or all of wheel_names.")
-    amplitude: float = fixed(6.0, "Largest voltage of either sign [V].", minimum=0.0)
-    max_voltage: float = fixed(12.0, "Amplitudes beyond this are refused [V].", minimum=0.0)
-    max_speed: float = fixed(0.0, "Largest speed of a wheel [rad/s]; 0 for any.", minimum=0.0)
-    max_current: float = fixed(0.0, "Largest current of a motor [A]; 0 for any.", minimum=0.0)
-    duration: float = fixed(20.0, "Length of the signal [s].", minimum=0.1, maximum=3600.0)
-    fade: float = fixed(0.0, "Time over which it grows and shrinks [s].", minimum=0.0)
+    wheels: tuple[str, ...] = fixed(("all",), "Wheels to excite, or all.")
+    amplitude: float = fixed(6.0, "Amplitude of the voltage [V].", minimum=0.0)
+    max_voltage: float = fixed(12.0, "Maximum amplitude [V].", minimum=0.0)
+    max_speed: float = fixed(0.0, "Speed limit of a wheel [rad/s]; 0: none.", minimum=0.0)
+    max_current: float = fixed(0.0, "Current limit of a motor [A]; 0: none.", minimum=0.0)
+    duration: float = fixed(20.0, "Duration of the signal [s].", minimum=0.1, maximum=3600.0)
+    fade: float = fixed(0.0, "Time of fading in, and of fading out [s].", minimum=0.0)
     rate: float = fixed(200.0, "Commands per second [Hz].", minimum=10.0, maximum=1000.0)
-    wait: float = fixed(10.0, "Longest wait for the motors' driver [s].", minimum=0.0)
-    seed: int = fixed(0, "Of fourier, prbs and steps.", minimum=0)
-    independent: bool = fixed(True, "Whether wheels get different fourier, prbs and steps signals.")
-    frequency: float = fixed(1.0, "Of sine and square [Hz].", minimum=0.0)
+    wait: float = fixed(10.0, "Maximum wait for the motors' driver [s].", minimum=0.0)
+    seed: int = fixed(0, "Seed of fourier, prbs and steps.", minimum=0)
+    independent: bool = fixed(True, "Whether the wheels' random signals differ.")
+    frequency: float = fixed(1.0, "Frequency of sine and square [Hz].", minimum=0.0)
     lowest: float = fixed(0.1, "Lowest frequency of fourier and chirp [Hz].", minimum=0.0)
     highest: float = fixed(20.0, "Highest frequency of fourier and chirp [Hz].", minimum=0.0)
-    tones: int = fixed(24, "Tones of fourier.", minimum=2, maximum=1000)
-    sweep: float = fixed(20.0, "One sweep of chirp [s].", minimum=0.0)
-    hold: float = fixed(0.0, "Of prbs and steps [s]; 0 for their defaults.", minimum=0.0)
-    period: float = fixed(20.0, "Of ramp [s].", minimum=0.0)
+    tones: int = fixed(24, "Number of tones of fourier.", minimum=2, maximum=1000)
+    sweep: float = fixed(20.0, "Duration of a sweep of chirp [s].", minimum=0.0)
+    hold: float = fixed(0.0, "Step length of prbs and steps [s]; 0: default.", minimum=0.0)
+    period: float = fixed(20.0, "Period of ramp [s].", minimum=0.0)
 
     def __post_init__(self) -> None:
         if self.signal not in SIGNALS:
@@ -99,22 +98,22 @@ class Excite(Node):
         bounds = Bounds(speed=settings.max_speed, current=settings.max_current)
         for k, wheel in enumerate(settings.chosen()):
             signal = settings.signal_of(k)
-            signal(0.0)  # Prepared now, not in the first period.
+            signal(0.0)  # initialise before the first period
             self._outputs.append((MotorWriter(self, f"{wheel}/"), signal))
             self._watched[wheel] = Protection(bounds)
             self._states[wheel] = PublisherWatch()
-            topic, take = f"{wheel}/motor_state", partial(self._watch, wheel)
+            topic, take = f"{wheel}/motor_state", partial(self._on_motor_state, wheel)
             self.create_subscription(MotorState, topic, take, runtime.STREAM_SUBSCRIBER)
         self._begin: float | None = None
         self._all_heard = math.inf
         self._created = time.monotonic()
         self._diagnostics = runtime.Diagnostics(self, self._assess)
-        self._timer = runtime.steady_timer(self, 1.0 / settings.rate, self._tick)
+        self._timer = runtime.steady_timer(self, 1.0 / settings.rate, self._on_timer)
 
-    def _tick(self) -> None:
+    def _on_timer(self) -> None:
         now, settings = time.monotonic(), self._settings
         if self._begin is None:
-            if not self._heard(now):
+            if not self._is_connected(now):
                 return
             self._begin = now
             self.get_logger().info(
@@ -130,45 +129,45 @@ class Excite(Node):
         for writer, signal in self._outputs:
             if writer.owner:
                 raise ParameterError(
-                    f"{writer.publisher.topic_name}: not yours, {writer.owner} drives this wheel; "
+                    f"{writer.publisher.topic_name}: rejected, {writer.owner} owns this wheel; "
                     "deactivate it first"
                 )
             writer.send(signal(elapsed), stamp)
         for wheel in self._unheard:
             self._unheard[wheel] += 1.0 / settings.rate
-            if self._unheard[wheel] > _SILENCE:
+            if self._unheard[wheel] > _SILENCE_S:
                 raise LimitError(
-                    f"{wheel}: no motor_state for {_SILENCE:g} s; does its driver run?"
+                    f"{wheel}: no motor_state for {_SILENCE_S:g} s; is its driver running?"
                 )
 
-    def _watch(self, wheel: str, message: MotorState, info: Mapping[str, Any]) -> None:
+    def _on_motor_state(self, wheel: str, message: MotorState, info: Mapping[str, Any]) -> None:
         self._unheard[wheel] = 0.0
         self._states[wheel].hear(info)
-        if self._states[wheel].doubled:
-            raise LimitError(two_publishers(self, f"{wheel}/motor_state"))
+        if self._states[wheel].has_two_publishers:
+            raise LimitError(describe_two_publishers(self, f"{wheel}/motor_state"))
         stamp = runtime.seconds(message.header.stamp)
         why = self._watched[wheel].add(stamp, message.current, message.velocity)
         if why and self._begin is not None:
             raise LimitError(f"{wheel}: {why}")
 
-    def _heard(self, now: float) -> bool:
+    def _is_connected(self, now: float) -> bool:
         publishers = [writer.publisher for writer, _ in self._outputs]
         silent = [p.topic_name for p in publishers if not p.get_subscription_count()]
         if silent and now - self._created > self._settings.wait:
             raise ParameterError(
-                f"nobody listens on {', '.join(silent)}; is the driver or motor_plant running?"
+                f"no subscriber on {', '.join(silent)}; is the driver or motor_plant running?"
             )
         if silent:
             self._all_heard = math.inf
             return False
-        # Recorders and wheels that are known but not connected yet are waited for, a little.
+        # Wait briefly for subscribers and wheels that are discovered but not yet connected.
         self._all_heard = min(self._all_heard, now)
         waited = now - self._all_heard
         unheard = (wheel for wheel in self._watched if wheel not in self._unheard)
         known = all(
             p.get_subscription_count() >= self.count_subscribers(p.topic_name) for p in publishers
         ) and not any(self.count_publishers(f"{wheel}/motor_state") for wheel in unheard)
-        return waited > _OTHERS and (known or waited > 4 * _OTHERS)
+        return waited > _CONNECTION_WAIT_S and (known or waited > 4 * _CONNECTION_WAIT_S)
 
     def _assess(self) -> tuple[bytes, str, Mapping[str, object]]:
         if self._begin is None:

@@ -1,12 +1,11 @@
-"""A single-threaded executor for control loops: the same callbacks for a third of the time.
+# SPDX-License-Identifier: Apache-2.0
+"""Single-threaded executor for control loops that takes a third of the stock executor's time.
 
-The stock executor gathers all entities, builds a wait set and wraps every callback in a task
-anew for every message, and wakes itself twice for each.  This one gathers again only when an
-entity was made or destroyed, and calls plain callbacks of subscriptions and timers directly.
-Everything else, and whatever is a coroutine, goes the stock way.
-
-While messages come in quick succession it waits for them, for timers and for guard conditions
-alone, and looks at the many other entities of a node only every :data:`LOOK`.
+The stock executor rebuilds its wait set and wraps every callback in a task for each message.
+This one rebuilds the wait set only when an entity is created or destroyed and calls plain
+callbacks of subscriptions and timers directly; coroutines and other entities are handled as in
+the stock executor.  While messages arrive in quick succession it waits for messages, timers and
+guard conditions only, and checks the other entities every :data:`LOOK_PERIOD_NS`.
 """
 
 import inspect
@@ -21,14 +20,14 @@ from rclpy.impl.implementation_singleton import rclpy_implementation as _rclpy
 from rclpy.subscription import Subscription
 from rclpy.waitable import NumberOfEntities
 
-_FOR_EVER = -1
+_NO_TIMEOUT = -1
 
-LOOK = 20_000_000
-"""Longest time that messages keep services, clients, events and actions waiting [ns]."""
+LOOK_PERIOD_NS = 20_000_000
+"""Maximum wait of services, clients, events and actions during a stream of messages."""
 
 
 class _WaitSet:
-    """The wait set of one collection of entities, which it keeps alive."""
+    """Wait set of a collection of entities, which it keeps alive."""
 
     def __init__(self, executor: "LeanExecutor", key: tuple[tuple[Any, ...], ...]) -> None:
         self.key = key
@@ -72,11 +71,11 @@ class _WaitSet:
         return True
 
     def release(self) -> None:
-        """Let go of the entities, so that destroyed ones are."""
+        """Release the entities, so that they can be destroyed."""
         self._stack.close()
 
     def wait(self, timeout: int) -> None:
-        """Wait until something is ready, or the time is over [ns]."""
+        """Wait until an entity is ready or the time-out expires [ns]."""
         waits = self._waits
         waits.clear_entities()
         for add, handle in self._adders:
@@ -93,18 +92,18 @@ class _WaitSet:
         return [w for w in self.waitables if w.is_ready(self._waits)]
 
 
-class Untouched(CallbackGroup):
-    """Subscriptions that the executor leaves alone: their owner takes from them, in batches."""
+class OwnerReads(CallbackGroup):
+    """Subscriptions whose owner reads them in batches; the executor ignores them."""
 
     def can_execute(self, entity: Any) -> bool:
-        """Never."""
+        """Return False."""
         return False
 
     beginning_execution = ending_execution = can_execute
 
 
 class LeanExecutor(SingleThreadedExecutor):
-    """Spins one or more nodes; only waiting without a time-out is lean."""
+    """Executor of one or more nodes; a time-out selects the stock implementation."""
 
     def __init__(self, **options: Any) -> None:
         super().__init__(**options)
@@ -116,32 +115,32 @@ class LeanExecutor(SingleThreadedExecutor):
         nodes = self.get_nodes()
         kinds = ("subscriptions", "timers", "clients", "services", "guards", "waitables")
         return tuple(
-            # What is taken by its owner wakes nobody, nor do events of it: data wake those, too.
+            # Subscriptions of OwnerReads and their events, which data also trigger, wake nobody.
             tuple(
                 e
                 for node in nodes
                 for e in getattr(node, kind)
-                if not isinstance(getattr(e, "callback_group", None), Untouched)
+                if not isinstance(getattr(e, "callback_group", None), OwnerReads)
             )
             for kind in kinds
         )
 
     def spin_once(self, timeout_sec: float | None = None) -> None:
-        """Wait for work and do all that is ready."""
+        """Wait for ready entities and execute them."""
         if timeout_sec is not None:
             super().spin_once(timeout_sec)
             return
         everything, stream = self._waits or self._gather()
         left = self._stream_until - time.monotonic_ns()
-        waits, longest = (stream, left) if left > 0 else (everything, _FOR_EVER)
+        waits, longest = (stream, left) if left > 0 else (everything, _NO_TIMEOUT)
         try:
             waits.wait(longest)
-        except InvalidHandle:  # an event of something that was just destroyed
+        except InvalidHandle:  # event of a destroyed entity
             self._release()
             return
         if not self.context.ok():
             raise ExternalShutdownException()
-        # First what tells of entities that the callbacks to come may destroy.
+        # First the events of entities that later callbacks may destroy
         for waitable in waits.ready_waitables():
             self._do_stock(waitable, self._take_living)
         for timer in waits.ready("timer"):
@@ -162,15 +161,15 @@ class LeanExecutor(SingleThreadedExecutor):
     def _take_living(self, waitable: Any) -> Any:
         try:
             return self._take_waitable(waitable)
-        except InvalidHandle:  # of something that a callback of this round destroyed
+        except InvalidHandle:  # destroyed by a callback of this round
             return None
 
     def _pace(self, heard: bool, looked: bool) -> None:
-        """Set until when to wait for messages alone."""
+        """Set until when to wait for messages only."""
         now = time.monotonic_ns()
         if looked:
-            in_succession = heard and now - self._heard < LOOK
-            self._stream_until = now + LOOK if in_succession else 0
+            in_succession = heard and now - self._heard < LOOK_PERIOD_NS
+            self._stream_until = now + LOOK_PERIOD_NS if in_succession else 0
         if heard:
             self._heard = now
 
@@ -252,6 +251,6 @@ class LeanExecutor(SingleThreadedExecutor):
             self._tasks = [t for t in self._tasks if not (t[0].done() or t[0].cancelled())]
 
     def shutdown(self, timeout_sec: float | None = None) -> bool:
-        """Stop, and let go of all entities."""
+        """Shut down and release all entities."""
         self._release()
         return bool(super().shutdown(timeout_sec))

@@ -1,8 +1,9 @@
-"""Gives back what a tool took from a running robot, when the tool was killed.
+# SPDX-License-Identifier: Apache-2.0
+"""Restores a robot's controllers and gains when a tool is killed.
 
-The tool writes what it owes, a line of JSON each time it changes.  The guard is a process of a
-session of its own, so that what ends the tool does not end it: when its standard input ends and
-the last line is not empty, it activates the controllers and sets the gains that stand there.
+The tool writes the state to restore as a line of JSON whenever it changes.  The guard runs in a
+session of its own, so that it survives the tool: at the end of its input it activates the
+controllers and sets the gains of the last line.
 """
 
 import contextlib
@@ -14,11 +15,11 @@ import time
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-TRY_FOR = 20.0  # how long a robot is asked to take back what is its own [s]
+RETRY_TIME_S = 20.0
 
 
 class Guard:
-    """The tool's end of the guard, which joins the graph by the tool's ROS arguments."""
+    """The tool's end of the guard."""
 
     def __init__(self, arguments: Sequence[str]) -> None:
         command, nowhere = [sys.executable, "-m", __name__, *arguments], subprocess.DEVNULL
@@ -27,15 +28,15 @@ class Guard:
             start_new_session=True,
         )  # fmt: skip
 
-    def note(self, owed: Mapping[str, Any]) -> None:
-        """Replace what is owed."""
+    def note(self, pending_restore: Mapping[str, Any]) -> None:
+        """Replace the state to restore."""
         assert self._process.stdin is not None
         with contextlib.suppress(BrokenPipeError):
-            self._process.stdin.write(json.dumps(owed) + "\n")
+            self._process.stdin.write(json.dumps(pending_restore) + "\n")
             self._process.stdin.flush()
 
     def close(self) -> None:
-        """Leave the rest, if there is any, to the guard."""
+        """End the guard's input; it restores any pending state."""
         assert self._process.stdin is not None
         with contextlib.suppress(BrokenPipeError):
             self._process.stdin.close()
@@ -44,23 +45,23 @@ class Guard:
 
 
 def main() -> int:
-    """Wait for the tool's end, and give back what it owes then."""
+    """Wait for the tool's end and restore the pending state."""
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, signal.SIG_IGN)
     from smp_motor_control.errors import SmpError
     from smp_motor_control.nodes.robot_client import RobotClient
 
     with RobotClient(sys.argv[1:], "robot_guard", guarded=False) as client:
-        owed: dict[str, Any] = {}
+        pending_restore: dict[str, Any] = {}
         for line in sys.stdin:
             if line.endswith("\n"):
-                owed = json.loads(line)
-        end = time.monotonic() + TRY_FOR
-        while owed and time.monotonic() < end:
+                pending_restore = json.loads(line)
+        end = time.monotonic() + RETRY_TIME_S
+        while pending_restore and time.monotonic() < end:
             with contextlib.suppress(SmpError):
-                client.give_back(owed)
-                owed = {}
-    return 1 if owed else 0
+                client.restore(pending_restore)
+                pending_restore = {}
+    return 1 if pending_restore else 0
 
 
 if __name__ == "__main__":

@@ -1,22 +1,22 @@
-"""ROS nodes that no other computer reaches."""
+# SPDX-License-Identifier: Apache-2.0
+"""Environment for ROS nodes on the loopback interface only."""
 
 import os
 
-from smp_motor_control.motor.file import shared
+from smp_motor_control.motor.file import find_config
 
 FAST_DDS = "rmw_fastrtps"
-"""The middleware that the profile is for: that of Jazzy, where none is chosen."""
+"""Jazzy's default middleware, for which the profile is written."""
 
 
-def environment() -> dict[str, str]:
-    """Return the environment in which nodes discover, and bind, on this computer alone.
+def loopback_environment() -> dict[str, str]:
+    """Return variables that restrict discovery and sockets to this computer.
 
-    The range LOCALHOST of ROS limits who is discovered: Fast DDS binds to every interface all the
-    same, which its profile ends.
+    ROS's range LOCALHOST restricts discovery only; Fast DDS needs the profile to bind to loopback.
     """
     if not os.environ.get("RMW_IMPLEMENTATION", FAST_DDS).startswith(FAST_DDS):
         return {"ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
     return {
         "ROS_AUTOMATIC_DISCOVERY_RANGE": "SYSTEM_DEFAULT",
-        "FASTRTPS_DEFAULT_PROFILES_FILE": str(shared("loopback.xml")),
+        "FASTRTPS_DEFAULT_PROFILES_FILE": str(find_config("loopback.xml")),
     }

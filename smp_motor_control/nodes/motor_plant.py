@@ -1,13 +1,14 @@
-"""Simulates the motors of a robot behind the topics of its hardware.
+# SPDX-License-Identifier: Apache-2.0
+"""Simulates the motors of a robot behind its hardware topics.
 
-Subscribes ``<wheel>/motor_command``, of one writer at a time, and ``<wheel>/load_torque``
-(``std_msgs/Float64``, [N m] at the wheel, positive against forward turning); publishes
-``<wheel>/motor_state``, ``<wheel>/motor_owner`` on every change and, once,
-``<wheel>/motor_description``.  A motor of the file may have faults, such as swapped leads
-(``leads: -1``; see :class:`~smp_motor_control.motor.file.Wiring`).
+Subscribes to ``<wheel>/motor_command``, of one writer at a time, and to ``<wheel>/load_torque``
+(``std_msgs/Float64``, [N m] at the wheel, positive against forward motion); publishes
+``<wheel>/motor_state``, ``<wheel>/motor_owner`` on changes and ``<wheel>/motor_description`` once.
+A motor file may specify wiring faults, such as swapped leads (``leads: -1``; see
+:class:`~smp_motor_control.motor.file.Wiring`).
 
-Physics runs on the steady clock over the real intervals; only the stamps are ROS time.  With
-``use_sim_time`` it runs on that of ``/clock``: at whatever pace, and not at all while that stands.
+The simulation runs on the steady clock and stamps with ROS time.  With ``use_sim_time`` it follows
+``/clock`` at any pace.
 """
 
 import gc
@@ -30,36 +31,38 @@ from smp_motor_control.motor.hardware import DrivenMotor, DriveSettings, Supply
 from smp_motor_control.nodes import motor_writer, runtime
 from smp_motor_control.nodes.settings import Parameters, given_parameters
 
-_FIXED = ParameterDescriptor(description="As in a motor file.", read_only=True)
+_MOTOR_PARAMETER = ParameterDescriptor(description="As in a motor file.", read_only=True)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Settings:
-    """Parameters of the node, beside ``motors.<wheel>.<key>`` as in a motor file."""
+    """Parameters of the node, in addition to ``motors.<wheel>.<key>`` as in a motor file."""
 
-    motors_file: str = fixed("", "File of the motors; where none are given, those of the paper.")
+    motors_file: str = fixed("", "Motor file; default: the paper's motors.")
     rate: float = fixed(
         200.0, "Samples per second of every motor [Hz].", minimum=1.0, maximum=2000.0
     )
     drive: DriveSettings = nested(DriveSettings(pwm_steps=1000, current_noise=0.01, latch=True))
     supply_resistance: float = described(
-        0.0, "Inner resistance of the battery that all motors share [ohm].", minimum=0.0
+        0.0, "Internal resistance of the common battery [ohm].", minimum=0.0
     )
     battery_voltage: float = described(
-        0.0, "Of the battery without load [V]; 0: the supply_voltage of the motors.", minimum=0.0
+        0.0,
+        "Open-circuit voltage of the battery [V]; 0: supply_voltage of the motors.",
+        minimum=0.0,
     )
-    ohmmeter: bool = fixed(True, "Whether the description tells the resistance, as measured.")
-    seed: int = fixed(1, "Of all noise.")
+    ohmmeter: bool = fixed(True, "Whether the description includes the resistance.")
+    seed: int = fixed(1, "Seed of all noise.")
 
 
-SHORTEST_INTERVAL = 0.5
-"""Of two samples, in periods: a timer that was late makes up for it, a microcontroller does not.
-A speed that is differenced over a sliver of a period would be all quantisation."""
+MIN_INTERVAL_RATIO = 0.5
+"""Minimum interval of samples in periods.  A late timer catches up, a microcontroller does not;
+a speed differenced over a short interval would be dominated by quantisation."""
 
-SAME_INSTANT, READINGS = 1.5, 8
-"""Both clocks are read at one instant if that takes at most so many times as long as at the sample
-before; else they are read again, so often.  Ten microseconds between them, where the voltage jumps
-by 20 V, shift a motor's angle by half a count of the paper's encoder, for good."""
+MAX_READING_RATIO, MAX_READINGS = 1.5, 8
+"""Reading both clocks is repeated, up to ``MAX_READINGS`` times, when it takes this many times as
+long as for the previous sample.  An offset of 10 us at a voltage step of 20 V shifts the angle
+permanently by half a count of the paper's encoder."""
 
 
 class Wheel:
@@ -79,29 +82,29 @@ class Wheel:
         )
         timeout = motor.settings.command_timeout
         self._instant = node.instant
-        self._driver = motor_writer.MotorDriver(node, name, timeout, self._command, description)
+        self._driver = motor_writer.MotorDriver(node, name, timeout, self._on_command, description)
         self.lease = self._driver.lease
         node.create_subscription(
-            Float64, f"{name}/load_torque", self._load, runtime.STREAM_SUBSCRIBER
+            Float64, f"{name}/load_torque", self._on_load, runtime.STREAM_SUBSCRIBER
         )
 
-    def _command(self, now: float, voltage: float) -> None:
+    def _on_command(self, now: float, voltage: float) -> None:
         if not self.motor.command(self._instant(), voltage):
             self.rejected += 1
 
-    def _load(self, message: Float64) -> None:
+    def _on_load(self, message: Float64) -> None:
         if not self.motor.load(self._instant(), message.data):
             self.rejected += 1
 
     def publish(self, now: float, stamp: Any) -> None:
-        """Sample at an instant of the physics' clock and publish it with its ROS time."""
+        """Sample at an instant of the simulation's clock and publish with a ROS stamp."""
         state = self._driver.state
         (
             state.voltage, state.current, state.velocity, state.position,
             state.encoder_count, state.duty_cycle,
         ) = self.motor.sample(now)  # fmt: skip
         self._driver.report(stamp)
-        self._driver.tell_owner(time.monotonic())
+        self._driver.publish_owner(time.monotonic())
 
 
 class MotorPlant(Node):
@@ -109,7 +112,7 @@ class MotorPlant(Node):
 
     def __init__(self) -> None:
         super().__init__("motor_plant")
-        self._given = Parameters(self, Settings, self._change, also_known=["motors."])
+        self._given = Parameters(self, Settings, self._on_change, also_known=["motors."])
         settings = self._given.settings
         entries = self._motors(settings)
         self._supply = Supply(0.0, settings.supply_resistance)
@@ -127,7 +130,7 @@ class MotorPlant(Node):
         self._reading = math.inf
         self._diagnostics = runtime.Diagnostics(self, self._assess, "simulation")
         timer = self.create_timer if self._simulated else partial(runtime.steady_timer, self)
-        self._timer = timer(self._period, self._tick)
+        self._timer = timer(self._period, self._on_timer)
         names = ", ".join(entries)
         self.get_logger().info(f"simulating {names} at {settings.rate:g} Hz")
         gc.collect()
@@ -135,25 +138,27 @@ class MotorPlant(Node):
 
     def _motors(self, settings: Settings) -> dict[str, motor_file.MotorEntry]:
         given = given_parameters(self)
-        motors = motor_file.motors_among(given)
+        motors = motor_file.extract_motors(given)
         if motors and settings.motors_file:
-            raise ParameterError("give either motors_file or motors.<wheel>.<key>, not both")
+            raise ParameterError(
+                "motors_file and motors.<wheel>.<key> are given; give only one of them"
+            )
         if motors:
             for name in (name for name in given if name.startswith("motors.")):
-                self.declare_parameter(name, given[name], _FIXED, ignore_override=True)
+                self.declare_parameter(name, given[name], _MOTOR_PARAMETER, ignore_override=True)
             return motor_file.parse_motors(motors, "parameters")
-        return motor_file.load_motors(settings.motors_file or motor_file.paper_motors())
+        return motor_file.load_motors(settings.motors_file or motor_file.find_paper_motors())
 
-    def _change(self, settings: Settings) -> None:
+    def _on_change(self, settings: Settings) -> None:
         self._supply.resistance = settings.supply_resistance
         self._supply.open_voltage = settings.battery_voltage or self._nominal
         for wheel in self._wheels:
             wheel.motor.settings = settings.drive
             wheel.lease.set_timeout(settings.drive.command_timeout)
 
-    def _tick(self) -> None:
+    def _on_timer(self) -> None:
         now, stamp = self._sampling_instant()
-        if now - self._last < SHORTEST_INTERVAL * self._period:
+        if now - self._last < MIN_INTERVAL_RATIO * self._period:
             return
         self._late += now - self._last > 1.5 * self._period
         self._last = now
@@ -162,22 +167,22 @@ class MotorPlant(Node):
             wheel.publish(now, stamp)
 
     def instant(self) -> float:
-        """Return the time of the physics, which never goes back [s]."""
+        """Return the monotonic time of the simulation [s]."""
         if not self._simulated:
             return time.monotonic()
         now = self.get_clock().now().nanoseconds
-        if not self._shown:  # the first time that is heard
+        if not self._shown:  # first message of /clock
             self._origin = now
-        self._origin += min(now - self._shown, 0)  # a clock that was set back stood still meanwhile
+        self._origin += min(now - self._shown, 0)  # a clock set back counts as stopped
         self._shown = now
         return (now - self._origin) * 1e-9
 
     def _sampling_instant(self) -> tuple[float, Any]:
-        """Return one instant on both clocks: hardware stamps when it samples, however busy."""
+        """Return one instant on both clocks."""
         if self._simulated:
             return self.instant(), self.get_clock().now().to_msg()
-        best, limit = math.inf, SAME_INSTANT * self._reading
-        for _ in range(READINGS):
+        best, limit = math.inf, MAX_READING_RATIO * self._reading
+        for _ in range(MAX_READINGS):
             before = time.monotonic()
             stamp = self.get_clock().now()
             after = time.monotonic()
@@ -202,14 +207,14 @@ class MotorPlant(Node):
             values |= {f"{wheel.name} {key}": value for key, value in of_wheel.items()}
         rejected = [wheel.name for wheel in self._wheels if wheel.rejected]
         late = [wheel.name for wheel in self._wheels if wheel.lease.late > wheel.late]
-        rivals = motor_writer.tell_refused({w.name: w.lease for w in self._wheels})
+        rivals = motor_writer.report_refused_writers({w.name: w.lease for w in self._wheels})
         for wheel in self._wheels:
             wheel.late = wheel.lease.late
         message = "simulating"
         if rejected:
-            message = f"refused messages that are no numbers: {rejected}"
+            message = f"refused non-finite messages: {', '.join(rejected)}"
         elif late:
-            message = f"refused commands that come late by their stamps: {late}"
+            message = f"refused commands with late stamps: {', '.join(late)}"
         elif rivals:
             message = rivals
         return runtime.WARN if rejected or late or rivals else runtime.OK, message, values

@@ -1,4 +1,5 @@
-"""One wheel's commands, under the sender's name, and who owns the wheel: both of their ends."""
+# SPDX-License-Identifier: Apache-2.0
+"""Both ends of a wheel's command topic, with the ownership of the wheel."""
 
 import math
 import os
@@ -14,15 +15,15 @@ from smp_motor_control import joint_of
 from smp_motor_control.nodes import runtime
 from smp_motor_control.wheel.lease import Lease
 
-_ZEROS = 3
+_FINAL_ZEROS = 3
 
 
 class MotorWriter:
-    """The way of a node to a motor; see :class:`~smp_motor_control.wheel.lease.Lease`."""
+    """Publisher of a wheel's commands; see :class:`~smp_motor_control.wheel.lease.Lease`."""
 
     def __init__(self, node: Node, prefix: str = "") -> None:
         self._node = node
-        # Two processes of one node are two writers.
+        # The process id distinguishes two processes with the same node name.
         self._name = f"{node.get_fully_qualified_name()}#{os.getpid()}"
         self._message = MotorCommand()
         self._message.header.frame_id = self._name
@@ -32,21 +33,21 @@ class MotorWriter:
         self._owners = node.create_subscription(
             String, f"{prefix}motor_owner", self._heard, runtime.LATCHED
         )
-        self.owner = ""  # another writer that owns the wheel, by what the driver says
+        self.owner = ""  # another writer that owns the wheel
 
     def _heard(self, message: String) -> None:
         self.owner = "" if message.data == self._name else message.data
 
     def send(self, voltage: float, stamp: Any = None) -> None:
-        """Command a voltage [V], stamped now unless it answers a sample."""
+        """Command a voltage [V] with the stamp of the sample it answers, or now."""
         message = self._message
         message.header.stamp = self._node.get_clock().now().to_msg() if stamp is None else stamp
         message.voltage = voltage
         self.publisher.publish(message)
 
     def stop(self) -> None:
-        """Command zero so that it arrives: best-effort readers may lose one datagram."""
-        for _ in range(_ZEROS - 1):
+        """Command zero repeatedly, as best-effort readers may lose a datagram."""
+        for _ in range(_FINAL_ZEROS - 1):
             self.send(0.0)
             time.sleep(0.005)
         self.send(0.0)
@@ -57,20 +58,20 @@ class MotorWriter:
         self._node.destroy_subscription(self._owners)
 
 
-def tell_refused(leases: Mapping[str, Lease]) -> str:
-    """Return the writers that were refused since last asked, by wheel; empty where none was."""
+def report_refused_writers(leases: Mapping[str, Lease]) -> str:
+    """Return a message on the writers refused since the previous call, by wheel; else nothing."""
     found = [f"{wheel}: {', '.join(sorted(one.refused))}" for wheel, one in leases.items()
              if one.refused]  # fmt: skip
     for one in leases.values():
         one.refused = {}
-    return f"not yours, refused on {'; '.join(found)}" if found else ""
+    return f"refused, another node owns the wheel: {'; '.join(found)}" if found else ""
 
 
 class MotorDriver:
-    """The driver's end: obeys the owner of the wheel's lease, says who that is, and reports.
+    """The driver's end: obeys the owner of the wheel, publishes its name and reports the state.
 
-    ``obey`` gets the instant [s] on a steady clock and the voltage [V]; ``state`` is the message
-    that :meth:`report` publishes, its stamp and frame filled in.
+    ``obey`` is called with the time on a steady clock [s] and the voltage [V]; :meth:`report`
+    publishes ``state``.
     """
 
     def __init__(
@@ -90,7 +91,7 @@ class MotorDriver:
         self._states = node.create_publisher(
             MotorState, f"{wheel}/motor_state", runtime.STREAM_PUBLISHER
         )
-        # A publisher that nothing holds would be destroyed, and what it latched with it.
+        # Keep a reference, or the publisher is destroyed with its latched message.
         self._descriptions = node.create_publisher(
             MotorDescription, f"{wheel}/motor_description", runtime.LATCHED
         )
@@ -106,12 +107,12 @@ class MotorDriver:
             self._obey(now, message.voltage)
 
     def report(self, stamp: Any) -> None:
-        """Publish the state as it is filled in now."""
+        """Publish ``state`` with a stamp."""
         self.state.header.stamp = stamp
         self._states.publish(self.state)
 
-    def tell_owner(self, now: float) -> None:
-        """Publish who owns the wheel, where that is another than before."""
+    def publish_owner(self, now: float) -> None:
+        """Publish the owner of the wheel when it changes."""
         owner = self.lease.owner(now)
         if owner != self._owner:
             self._owner = owner

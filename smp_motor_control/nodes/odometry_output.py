@@ -1,4 +1,5 @@
-"""Odometry and joint states as messages: /odom, /joint_states and, where possible, /tf."""
+# SPDX-License-Identifier: Apache-2.0
+"""Publishers of odom, joint_states and, if tf2_msgs is installed, /tf."""
 
 import math
 from collections.abc import Mapping
@@ -15,19 +16,19 @@ from smp_motor_control.body.odometry import Odometry
 from smp_motor_control.body.wheel_travel import WheelSample
 from smp_motor_control.nodes.skid_steer_settings import Settings
 
-UNKNOWN = 1e6  # variance of what wheels on a plane cannot tell: height, roll and pitch
-SIDEWAYS = 1e-3  # variance of the sideways velocity of a body that skids [m^2/s^2]
-STILL = 1e-6  # least variance of a velocity, for filters that divide by it
+UNOBSERVED_VARIANCE = 1e6  # of height, roll and pitch
+SIDEWAYS_VARIANCE = 1e-3  # of the sideways velocity of a skidding body [m^2/s^2]
+MIN_VARIANCE = 1e-6  # of a velocity, for filters that divide by it
 
 
 def frame_prefix(enable: bool, prefix: str, namespace: str) -> str:
-    """Return what comes before the names of the frames."""
+    """Return the prefix of the frame names."""
     inner = (prefix or namespace).strip("/") if enable else ""
     return f"{inner}/" if inner else ""
 
 
 class OdometryOutput:
-    """Publishers of a node that knows where the body is."""
+    """Publishers of odometry and joint states."""
 
     def __init__(self, node: Node, settings: Settings) -> None:
         prefix = frame_prefix(
@@ -48,7 +49,7 @@ class OdometryOutput:
         try:
             from tf2_msgs.msg import TFMessage
         except ImportError:
-            node.get_logger().info("tf2_msgs is not installed: nothing is published on /tf")
+            node.get_logger().info("tf2_msgs is not installed: /tf is not published")
             return
         self._tf = node.create_publisher(TFMessage, "/tf", 100)
         self._transform = TransformStamped(child_frame_id=self._odometry.child_frame_id)
@@ -61,10 +62,12 @@ class OdometryOutput:
         pose.pose.position.x, pose.pose.position.y = odometry.x, odometry.y
         half = math.remainder(odometry.heading, 2.0 * math.pi) / 2.0
         pose.pose.orientation.z, pose.pose.orientation.w = math.sin(half), math.cos(half)
-        pose.covariance = _spread(odometry.covariance)
+        pose.covariance = _expand_covariance(odometry.covariance)
         twist.twist.linear.x, twist.twist.angular.z = odometry.linear, odometry.angular
         linear, angular = odometry.twist_variances(self._span)
-        twist.covariance = _spread(np.diag([linear + STILL, SIDEWAYS, angular + STILL]))
+        twist.covariance = _expand_covariance(
+            np.diag([linear + MIN_VARIANCE, SIDEWAYS_VARIANCE, angular + MIN_VARIANCE])
+        )
         self._publisher.publish(message)
         if self._tf is not None:
             self._transform.header = message.header
@@ -74,7 +77,7 @@ class OdometryOutput:
             self._tf.publish(self._transforms)
 
     def publish_joints(self, wheels: Mapping[str, WheelSample], stamp: float) -> None:
-        """Publish the wheels that were heard."""
+        """Publish the joint states of the wheels heard so far."""
         heard = [w for w in self._wheels if w in wheels and math.isfinite(wheels[w].position)]
         if not heard:
             return
@@ -87,8 +90,8 @@ class OdometryOutput:
         self._joints.publish(message)
 
 
-def _spread(planar: np.ndarray) -> np.ndarray:
-    """Return the 6 x 6 covariance of (x, y, z, roll, pitch, yaw), row by row."""
-    matrix = np.diag([0.0, 0.0, UNKNOWN, UNKNOWN, UNKNOWN, 0.0])
+def _expand_covariance(planar: np.ndarray) -> np.ndarray:
+    """Return the 6 x 6 covariance of (x, y, z, roll, pitch, yaw), row-major."""
+    matrix = np.diag([0.0, 0.0, UNOBSERVED_VARIANCE, UNOBSERVED_VARIANCE, UNOBSERVED_VARIANCE, 0.0])
     matrix[np.ix_((0, 1, 5), (0, 1, 5))] = planar
     return matrix.ravel()

@@ -1,8 +1,9 @@
-"""Two publishers of one topic, such as a forgotten node or a second robot on the domain.
+# SPDX-License-Identifier: Apache-2.0
+"""Detection of two publishers on one topic, such as a second robot on the domain.
 
-Each publisher numbers its messages, so that the numbers which a subscription sees fall again and
-again where two send at once.  They fall once where a publisher was started anew; the graph, which
-keeps a killed node for some seconds, does not tell these apart, but knows the names.
+With two publishers the sequence numbers seen by a subscription fall repeatedly; after a restart of
+one publisher they fall once.  The graph cannot distinguish these cases, as it keeps a killed node
+for some seconds, but it provides the names.
 """
 
 import time
@@ -12,23 +13,22 @@ from typing import Any
 
 from rclpy.node import Node
 
-FALLS = 4
-"""How often numbers fall within :data:`WINDOW` where two publishers send at once."""
-
-WINDOW = 1.0  # [s]
-UNKNOWN = "_NODE_NAME_UNKNOWN_"
-"""What the middleware calls the node of an endpoint that it discovered before the node."""
+DECISIVE_FALLS = 4
+"""Falls of the number within :data:`WINDOW_S` that show two publishers."""
+WINDOW_S = 1.0
+UNKNOWN_NODE = "_NODE_NAME_UNKNOWN_"
+"""The middleware's name of a node whose endpoint is discovered first."""
 
 
 class PublisherWatch:
-    """Watches the numbers of one topic's messages; ``doubled`` says whether two publishers send."""
+    """Watch the sequence numbers of a topic's messages."""
 
     def __init__(self) -> None:
         self._last = 0
-        self._falls: deque[float] = deque(maxlen=FALLS)
+        self._falls: deque[float] = deque(maxlen=DECISIVE_FALLS)
 
     def hear(self, info: Mapping[str, Any]) -> bool:
-        """Take in a message's info; return whether it is of another publisher than the last."""
+        """Add a message's info; return whether its publisher differs from the previous one."""
         number = info["publication_sequence_number"] or 0
         fell = 0 < number <= self._last
         self._last = number
@@ -37,24 +37,24 @@ class PublisherWatch:
         return fell
 
     @property
-    def doubled(self) -> bool:
-        """Whether two publishers sent within the last second."""
+    def has_two_publishers(self) -> bool:
+        """Whether two publishers sent within the last :data:`WINDOW_S`."""
         falls = self._falls
-        return len(falls) == FALLS and falls[0] > time.monotonic() - WINDOW
+        return len(falls) == DECISIVE_FALLS and falls[0] > time.monotonic() - WINDOW_S
 
 
-def are_known(node: Node, topic: str) -> bool:
-    """Tell whether the nodes of all publishers were discovered."""
+def are_publishers_known(node: Node, topic: str) -> bool:
+    """Return whether the nodes of all publishers are discovered."""
     infos = node.get_publishers_info_by_topic(node.resolve_topic_name(topic))
-    return all(info.node_name != UNKNOWN for info in infos)
+    return all(info.node_name != UNKNOWN_NODE for info in infos)
 
 
-def publishers_of(node: Node, topic: str) -> str:
-    """Return the names of a topic's publishers as the graph has them, such as ``2 x /play``."""
+def name_publishers(node: Node, topic: str) -> str:
+    """Return the names of a topic's publishers in the graph, such as ``2 x /play``."""
     infos = node.get_publishers_info_by_topic(node.resolve_topic_name(topic))
     names = Counter(
         "an unknown node"
-        if info.node_name == UNKNOWN
+        if info.node_name == UNKNOWN_NODE
         else f"{info.node_namespace.rstrip('/')}/{info.node_name}"
         for info in infos
     )
@@ -63,16 +63,16 @@ def publishers_of(node: Node, topic: str) -> str:
     )
 
 
-def two_publishers(node: Node, topic: str) -> str:
-    """Return what is to be said of a topic on which two publishers send at once."""
-    names = publishers_of(node, topic) or "two nodes"
-    return f"{node.resolve_topic_name(topic)} comes from {names} at once: end one of them"
+def describe_two_publishers(node: Node, topic: str) -> str:
+    """Return the message about a topic with two publishers."""
+    names = name_publishers(node, topic) or "two nodes"
+    return f"{node.resolve_topic_name(topic)} comes from {names} at once; end one of them"
 
 
-def watched(
+def with_watch(
     watch: PublisherWatch, take: Callable[[Any], object]
 ) -> Callable[[Any, Mapping[str, Any]], None]:
-    """Return a subscription's callback that lets a watch hear what ``take`` is given."""
+    """Return a callback that passes messages to ``take`` and their info to a watch."""
 
     def callback(message: Any, info: Mapping[str, Any]) -> None:
         watch.hear(info)

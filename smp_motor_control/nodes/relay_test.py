@@ -1,7 +1,8 @@
-"""A relay that makes one wheel oscillate, bounded in voltage and time.
+# SPDX-License-Identifier: Apache-2.0
+"""Relay test of one wheel, bounded in voltage and time.
 
-First a constant voltage shows the speed to oscillate around, then the relay switches around it.
-Whatever ends it, the last command is zero and the wheel's controller is as it was.
+A constant voltage determines the speed around which the relay then switches.  The test always ends
+with a zero command and the controller's previous state.
 """
 
 import math
@@ -12,40 +13,39 @@ import numpy as np
 from smp_interfaces.msg import MotorState
 from smp_motor_control.nodes import runtime
 from smp_motor_control.nodes.motor_writer import MotorWriter
-from smp_motor_control.nodes.robot_client import PATIENCE, RobotClient, RobotError
+from smp_motor_control.nodes.robot_client import TIMEOUT_S, RobotClient, RobotError
 
-SETTLE = 1.5  # how long the constant voltage acts; its last half second tells the speed [s]
-FOLLOWED = 0.1
-"""Share of the relay's amplitude by which what acts may differ from what is asked for."""
+SETTLING_TIME_S = 1.5  # of the constant voltage; the speed is averaged over the last half second
+MAX_VOLTAGE_ERROR = 0.1
+"""Tolerated difference of applied and commanded voltage, relative to the relay's amplitude."""
 
-MOST_BETWEEN = 0.5
-"""Share of samples at whose voltage the relay never is, above which someone else commands."""
+MAX_SHARE_BETWEEN = 0.5
+"""Maximum fraction of samples between the relay's levels; above it another node commands."""
 
 
 Oscillation = dict[str, np.ndarray]
-"""What was recorded, around its rest: ``time`` by the stamps [s]; ``voltage`` asked for after each
-sample, and ``applied``, the mean over the interval before it [V]; ``speed`` and ``angle`` of the
-wheel [rad/s], [rad].  ``applied`` and ``angle`` are NaN where the hardware tells none."""
+"""Recorded deviations from the operating point: ``time`` by the stamps [s]; ``voltage`` commanded
+after each sample and ``applied``, the mean before it [V]; ``speed`` and ``angle`` of the wheel
+[rad/s], [rad].  ``applied`` and ``angle`` are NaN if not reported."""
 
 
 @dataclass(frozen=True)
 class Relay:
-    """What switches."""
+    """Relay with hysteresis."""
 
-    # bias, amplitude: it switches between ``bias - amplitude`` and ``bias + amplitude`` [V]
-    bias: float
-    amplitude: float
-    hysteresis: float  # the speed must pass this on either side before it switches [rad/s, wheel]
+    bias: float  # [V]
+    amplitude: float  # [V]
+    hysteresis: float  # [rad/s, wheel]
 
 
 class _Test:
-    """Answers every sample with a voltage."""
+    """Relay test that answers every sample with a voltage."""
 
     def __init__(self, client: RobotClient, wheel: str, relay: Relay) -> None:
         self.client, self.wheel, self.relay = client, wheel, relay
         self.centre: float | None = None
         self.output = relay.bias
-        # Of each sample stamp, voltage asked for and applied, speed, angle
+        # Stamp, commanded and applied voltage, speed, angle
         self.seen: list[tuple[float, ...]] = []
         self.writer = MotorWriter(client.node, f"{wheel}/")
 
@@ -64,34 +64,36 @@ class _Test:
     def run(self, duration: float) -> Oscillation:
         seen = self.seen
         with self.client.listen(MotorState, {f"{self.wheel}/motor_state": self.answer}):
-            if not self.client.until(self._acts, PATIENCE):
+            if not self.client.until(self._is_applied, TIMEOUT_S):
                 raise self._not_followed()
-            self.client.spin(SETTLE)
+            self.client.spin(SETTLING_TIME_S)
             first = len(seen)
             if first < 20:
-                raise RobotError(f"{self.wheel}: {first} samples came in {SETTLE} s")
+                raise RobotError(f"{self.wheel}: only {first} samples in {SETTLING_TIME_S} s")
             late = [row[3] for row in seen if row[0] > seen[-1][0] - 0.5]
             self.centre = sum(late) / len(late)
             self.output = self.relay.bias + self.relay.amplitude
             self.client.spin(duration)
         return self._around_rest(first)
 
-    def _acts(self) -> bool:
-        """Return whether the wheel has the constant voltage, as far as its hardware tells."""
+    def _is_applied(self) -> bool:
+        """Return whether the hardware applies the constant voltage, if it reports this."""
         if not self.seen or not self.writer.publisher.get_subscription_count():
             return False
         off = abs(self.seen[-1][2] - self.output)
-        return not off > FOLLOWED * self.relay.amplitude  # NaN: not known
+        return not off > MAX_VOLTAGE_ERROR * self.relay.amplitude  # NaN: not reported
 
     def _not_followed(self) -> RobotError:
         topic = self.writer.publisher.topic_name
         if not self.seen:
-            return RobotError(f"{self.wheel}/motor_state: no sample came in {PATIENCE:g} s")
+            return RobotError(
+                f"{self.wheel}/motor_state: no sample in {TIMEOUT_S:g} s; is its driver running?"
+            )
         if not self.writer.publisher.get_subscription_count():
-            return RobotError(f"{topic}: nobody listens; start motor_plant or the robot's driver")
+            return RobotError(f"{topic}: no subscriber; start motor_plant or the robot's driver")
         return RobotError(
-            f"{topic}: what acts on the wheel is not what the relay asks for; "
-            f"{self.writer.owner or 'someone else'} commands it"
+            f"{topic}: the applied voltage differs from the command; "
+            f"{self.writer.owner or 'another node'} commands the wheel, end it first"
         )
 
     def _around_rest(self, first: int) -> Oscillation:
@@ -99,9 +101,9 @@ class _Test:
         time, angle = (rows[:, k] - rows[:1, k] for k in (0, 4))
         bias, amplitude, centre = self.relay.bias, self.relay.amplitude, self.centre or 0.0
         applied = rows[:, 2] - bias
-        # A relay is at one of its levels but for the samples in which it switches.
-        between = np.abs(np.abs(applied) - amplitude) > FOLLOWED * amplitude
-        if np.count_nonzero(between) > MOST_BETWEEN * len(applied):
+        # The applied voltage is at one of the relay's levels except where it switches.
+        between = np.abs(np.abs(applied) - amplitude) > MAX_VOLTAGE_ERROR * amplitude
+        if np.count_nonzero(between) > MAX_SHARE_BETWEEN * len(applied):
             raise self._not_followed()
         return {
             "time": time,
@@ -113,8 +115,8 @@ class _Test:
 
 
 def oscillate(client: RobotClient, wheel: str, relay: Relay, duration: float) -> Oscillation:
-    """Do the test on a running wheel whose controller is paused meanwhile."""
-    client.wait_for_wheels([wheel], PATIENCE)
+    """Run the test on a wheel with its controller paused."""
+    client.wait_for_wheels([wheel], TIMEOUT_S)
     with client.paused([wheel]):
         test = _Test(client, wheel, relay)
         try:

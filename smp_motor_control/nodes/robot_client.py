@@ -1,8 +1,9 @@
-"""The one client of a running robot: its wheels, services, parameters, lifecycle and graph.
+# SPDX-License-Identifier: Apache-2.0
+"""Client of a running robot: wheels, services, parameters, lifecycle and graph.
 
-A tool holds it as a block.  Names are relative to the robot's namespace, which ROS arguments
-give (``--ros-args -r __ns:=/robot1``).  What the client pauses or puts on trial is given back
-when the block ends; :mod:`smp_motor_control.nodes.guard` does it where the tool was killed.
+It is used as a context manager.  Names are relative to the robot's namespace, which the ROS
+arguments set (``--ros-args -r __ns:=/robot1``).  Paused controllers and gains on trial are restored
+at the end of the block, or by :mod:`smp_motor_control.nodes.guard` if the tool is killed.
 """
 
 import contextlib
@@ -28,39 +29,44 @@ from smp_motor_control import controller_of
 from smp_motor_control.errors import SmpError
 from smp_motor_control.nodes.executor import LeanExecutor
 from smp_motor_control.nodes.guard import Guard
-from smp_motor_control.nodes.publishers import UNKNOWN, PublisherWatch, are_known, two_publishers
+from smp_motor_control.nodes.publishers import (
+    UNKNOWN_NODE,
+    PublisherWatch,
+    are_publishers_known,
+    describe_two_publishers,
+)
 from smp_motor_control.nodes.runtime import LATCHED, STREAM_SUBSCRIBER, seconds, steady_timer
 
-PATIENCE = 10.0
-"""Longest wait for a service or a topic [s]; on a busy machine discovery takes seconds."""
+TIMEOUT_S = 10.0
+"""Time-out of services and topics; on a busy machine discovery takes seconds."""
 
-AGAIN = 0.25
-"""Time in which a service answers, or is asked again [s]: an answer is lost where the node has
-not yet discovered this client, so no request may do harm twice."""
+RETRY_PERIOD_S = 0.25
+"""Period at which a request is repeated, as the answer is lost if the node has not yet discovered
+this client; requests must be idempotent."""
 
-LOOK = 0.02  # interval at which a condition is looked at [s]
-ENOUGH = 30  # states of a wheel that tell whether one node publishes them
-DISCOVERY = 1.0  # time in which a free machine discovers what is there [s]
+POLL_PERIOD_S = 0.02
+DECISIVE_SAMPLES = 30  # states of a wheel that show whether one node publishes them
+DISCOVERY_S = 1.0  # discovery time on an idle machine
 GET, SET = "get_parameters", "set_parameters_atomically"
 
-_AFTER = {"configure": "inactive", "activate": "active", "deactivate": "inactive"}
+_RESULTING_STATE = {"configure": "inactive", "activate": "active", "deactivate": "inactive"}
 
 
 class RobotError(SmpError):
-    """What the robot did not answer or refused, in a line for the user."""
+    """The robot refused a request or did not answer."""
 
     exit_code = 1
 
 
 class RobotClient:
-    """A node beside the robot's, spun only while one of its methods waits."""
+    """Node that is spun only while one of its methods waits."""
 
     def __init__(
         self, arguments: Sequence[str] = (), name: str = "robot_client", guarded: bool = True
     ) -> None:
         self._arguments, self._name, self._guarded = list(arguments), name, guarded
         self._clients: dict[str, Any] = {}
-        self.owed: dict[str, Any] = {}
+        self.pending_restore: dict[str, Any] = {}
         self._guard: Guard | None = None
 
     def __enter__(self) -> "RobotClient":
@@ -74,15 +80,15 @@ class RobotClient:
         self.node = rclpy.create_node(self._name, context=self._context)
         self._executor = LeanExecutor(context=self._context)
         self._executor.add_node(self.node)
-        steady_timer(self.node, LOOK, lambda: None)  # wakes the executor
+        steady_timer(self.node, POLL_PERIOD_S, lambda: None)  # wakes the executor
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Give back what is owed, and leave; the guard does what fails here."""
+        """Restore the pending state and leave; the guard does what fails here."""
         try:
             with contextlib.suppress(SmpError):
-                self.give_back(self.owed)
-                self.owe()
+                self.restore(self.pending_restore)
+                self.set_pending_restore()
         finally:
             if self._guard is not None:
                 self._guard.close()
@@ -93,7 +99,7 @@ class RobotClient:
     # Waiting -------------------------------------------------------------------------------
 
     def until(self, condition: Callable[[], bool], timeout: float) -> bool:
-        """Spin until a condition holds; return whether it did in time [s]."""
+        """Spin until a condition holds; return False at the time-out [s]."""
         end = time.monotonic() + timeout
         while not condition():
             if time.monotonic() >= end or not self._context.ok():
@@ -111,7 +117,7 @@ class RobotClient:
         topics: Mapping[str, Callable[[Any], None]],
         quality: QoSProfile = STREAM_SUBSCRIBER,
     ) -> Any:
-        """Hand messages to callables, by topic, inside the block."""
+        """Pass messages to callables by topic inside the block."""
         listen = self.node.create_subscription
         made = [listen(kind, topic, take, quality) for topic, take in topics.items()]
         try:
@@ -128,24 +134,24 @@ class RobotClient:
         take: Callable[..., object],
         quality: QoSProfile = STREAM_SUBSCRIBER,
     ) -> Any:
-        """Hand messages of a topic of every wheel to a callable, behind the wheel's name.
+        """Call ``take(wheel, message)`` for a topic of every wheel inside the block.
 
-        A callable of three arguments gets what the middleware knows of the message, too.
+        A callable with three arguments also gets the message's info.
         """
         topics = {f"{wheel}/{topic}": partial(take, wheel) for wheel in wheels}
         return self.listen(kind, topics, quality)
 
     def find_wheels(self) -> list[str]:
-        """Return the wheels whose hardware reports in the robot's namespace, after a second."""
-        self.spin(DISCOVERY)
-        pattern = re.compile(re.escape(self._full("")) + r"(\w+)/motor_state")
+        """Return the wheels whose hardware is discovered in the robot's namespace."""
+        self.spin(DISCOVERY_S)
+        pattern = re.compile(re.escape(self._absolute_name("")) + r"(\w+)/motor_state")
         topics = [name for name, _ in self.node.get_topic_names_and_types()]
         return [found[1] for name in sorted(topics) if (found := pattern.fullmatch(name))]
 
     def wait_for_wheels(self, wheels: Sequence[str], timeout: float) -> dict[str, float]:
         """Wait until every wheel has reported for half a second; return their rates [Hz].
 
-        Wheels that two publishers report, and reports without a stamp, are errors.
+        Two publishers of a wheel and reports without a stamp are errors.
         """
         stamps: dict[str, list[float]] = {wheel: [] for wheel in wheels}
         watches = {wheel: PublisherWatch() for wheel in wheels}
@@ -155,8 +161,8 @@ class RobotClient:
             stamp = seconds(message.header.stamp)
             if not stamp:
                 raise RobotError(
-                    f"{self._full(wheel)}/motor_state has no stamp; its driver must fill in the "
-                    "instant of sampling"
+                    f"{self._absolute_name(wheel)}/motor_state has no stamp; its driver must set "
+                    "the time of sampling"
                 )
             stamps[wheel].append(stamp)
 
@@ -167,14 +173,16 @@ class RobotClient:
         self._refuse_doubled(watches)
         if not heard:
             silent = [wheel for wheel, seen in stamps.items() if not seen or seen[-1] == seen[0]]
-            topic = ", ".join(self._full(f"{wheel}/motor_state") for wheel in silent or wheels)
+            topic = ", ".join(
+                self._absolute_name(f"{wheel}/motor_state") for wheel in silent or wheels
+            )
             raise RobotError(
-                f"nothing heard on {topic} within {timeout:.0f} s; does the hardware's driver run?"
+                f"no message on {topic} within {timeout:.0f} s; is the hardware's driver running?"
             )
         return {w: (len(s) - 1) / (s[-1] - s[0]) for w, s in stamps.items()}
 
     def refuse_second_reporters(self, wheels: Iterable[str]) -> None:
-        """Raise where two nodes publish the state of one wheel, and name both."""
+        """Raise when two nodes publish the state of one wheel."""
         watches = {wheel: PublisherWatch() for wheel in wheels}
         heard = dict.fromkeys(watches, 0)
 
@@ -183,45 +191,55 @@ class RobotClient:
             heard[wheel] += 1
 
         def decided() -> bool:
-            seen = min(heard.values(), default=ENOUGH) >= ENOUGH
-            return seen or any(one.doubled for one in watches.values())
+            seen = min(heard.values(), default=DECISIVE_SAMPLES) >= DECISIVE_SAMPLES
+            return seen or any(one.has_two_publishers for one in watches.values())
 
         with self.listen_to_wheels(MotorState, "motor_state", watches, take):
-            self.until(decided, DISCOVERY)
+            self.until(decided, DISCOVERY_S)
         self._refuse_doubled(watches)
 
     def _refuse_doubled(self, watches: Mapping[str, PublisherWatch]) -> None:
-        topics = [f"{wheel}/motor_state" for wheel, one in watches.items() if one.doubled]
+        topics = [
+            f"{wheel}/motor_state" for wheel, one in watches.items() if one.has_two_publishers
+        ]
         if topics:
-            self.until(lambda: all(are_known(self.node, one) for one in topics), DISCOVERY)
-            raise RobotError("; ".join(two_publishers(self.node, topic) for topic in topics))
+            self.until(
+                lambda: all(are_publishers_known(self.node, one) for one in topics), DISCOVERY_S
+            )
+            raise RobotError(
+                "; ".join(describe_two_publishers(self.node, topic) for topic in topics)
+            )
 
     def runs_controller(self, wheel: str) -> bool:
-        """Tell whether a wheel's ``wheel_pid`` has been discovered."""
+        """Return whether a wheel's ``wheel_pid`` is discovered."""
         service = self.node.resolve_service_name(f"{controller_of(wheel)}/change_state")
         return bool(self.node.count_services(service))
 
     def wait_for_nodes(self, nodes: Sequence[str], timeout: float) -> None:
-        """Wait until every node can be asked for its parameters."""
+        """Wait for the parameter services of all nodes."""
         for node in nodes:
             if not self.until(
                 self._client(SetParametersAtomically, f"{node}/{SET}").service_is_ready, timeout
             ):
-                raise RobotError(f"{self._full(node)} does not answer within {timeout:.0f} s")
+                raise RobotError(
+                    f"{self._absolute_name(node)} does not answer within {timeout:.0f} s"
+                )
 
     def wait_for_listener(self, node: str, topics: Sequence[str], timeout: float) -> None:
-        """Wait until a node subscribes all of the topics."""
+        """Wait until a node subscribes to all topics."""
         look = self.node.get_subscriptions_info_by_topic
 
         def missing() -> list[str]:
-            return [t for t in topics if node not in {i.node_name for i in look(self._full(t))}]
+            return [
+                t for t in topics if node not in {i.node_name for i in look(self._absolute_name(t))}
+            ]
 
         if not self.until(lambda: not missing(), timeout):
-            raise RobotError(f"{node} does not listen to {', '.join(missing())}")
+            raise RobotError(f"{node} does not subscribe to {', '.join(missing())}; is it running?")
 
     # Services ------------------------------------------------------------------------------
 
-    def _full(self, name: str) -> str:
+    def _absolute_name(self, name: str) -> str:
         return f"{self.node.get_namespace().rstrip('/')}/{name}"
 
     def _client(self, kind: Any, name: str) -> Any:
@@ -230,9 +248,9 @@ class RobotClient:
         return self._clients[name]
 
     def ask_all(
-        self, kind: Any, requests: Mapping[str, Any], patience: float = PATIENCE
+        self, kind: Any, requests: Mapping[str, Any], patience: float = TIMEOUT_S
     ) -> dict[str, Any]:
-        """Ask services at once; return the answers by the services' names."""
+        """Call services concurrently; return the answers by service name."""
         clients = {name: self._client(kind, name) for name in requests}
         asked: dict[str, list[Any]] = {name: [] for name in requests}
 
@@ -244,7 +262,9 @@ class RobotClient:
             for name, request in requests.items():
                 if not answered(name) and clients[name].service_is_ready():
                     asked[name].append(clients[name].call_async(request))
-            self.until(lambda: all(map(answered, requests)), min(AGAIN, end - time.monotonic()))
+            self.until(
+                lambda: all(map(answered, requests)), min(RETRY_PERIOD_S, end - time.monotonic())
+            )
         for name, futures in asked.items():
             for future in futures:
                 if not future.done():
@@ -260,7 +280,7 @@ class RobotClient:
         return {n: next(f for f in asked[n] if f.done()).result() for n in requests}
 
     def get_parameters(self, nodes: Mapping[str, Sequence[str]]) -> dict[str, dict[str, Any]]:
-        """Return the parameters of nodes by name; those that are not set are left out."""
+        """Return the parameters of nodes by name, without those that are not set."""
         requests = {f"{n}/{GET}": GetParameters.Request(names=list(p)) for n, p in nodes.items()}
         answers = self.ask_all(GetParameters, requests)
         found: dict[str, dict[str, Any]] = {}
@@ -271,9 +291,9 @@ class RobotClient:
         return found
 
     def set_parameters(
-        self, nodes: Mapping[str, Mapping[str, Any]], patience: float = PATIENCE
+        self, nodes: Mapping[str, Mapping[str, Any]], patience: float = TIMEOUT_S
     ) -> None:
-        """Set parameters of nodes, all of a node at once or none."""
+        """Set parameters of nodes, atomically for each node."""
         requests = {}
         for node, values in nodes.items():
             given = [Parameter(n, value=v).to_parameter_msg() for n, v in values.items()]
@@ -282,18 +302,20 @@ class RobotClient:
         results = {node: answers[f"{node}/{SET}"].result for node in nodes}
         why = {node: result.reason for node, result in results.items() if not result.successful}
         if why:
-            refused = (f"{self._full(n)} refused the parameters: {r}" for n, r in why.items())
+            refused = (
+                f"{self._absolute_name(n)} refused the parameters: {r}" for n, r in why.items()
+            )
             raise RobotError("; ".join(refused))
 
     def get_states(self, nodes: Sequence[str]) -> dict[str, str]:
-        """Return the state of lifecycle nodes, such as ``active``."""
+        """Return the states of lifecycle nodes, such as ``active``."""
         answers = self.ask_all(GetState, {f"{n}/get_state": GetState.Request() for n in nodes})
         return {node: answers[f"{node}/get_state"].current_state.label for node in nodes}
 
     def change_states(self, nodes: Sequence[str], transition: str) -> None:
-        """Have lifecycle nodes go through a transition: ``configure``, ``activate``, ...
+        """Perform a transition of lifecycle nodes: ``configure``, ``activate``, ...
 
-        The state decides and not the answer: asked again, a node that is there already refuses.
+        Success is judged by the state: a node that has already made the transition refuses it.
         """
         number = getattr(Transition, f"TRANSITION_{transition.upper()}")
         request = ChangeState.Request(transition=Transition(id=number))
@@ -302,78 +324,80 @@ class RobotClient:
             if left:
                 self.ask_all(ChangeState, {f"{node}/change_state": request for node in left})
                 states = self.get_states(left)
-                left = [node for node in left if states[node] != _AFTER[transition]]
+                left = [node for node in left if states[node] != _RESULTING_STATE[transition]]
         if left:
-            said = ", ".join(f"{self._full(node)} ({states[node]})" for node in left)
+            said = ", ".join(f"{self._absolute_name(node)} ({states[node]})" for node in left)
             raise RobotError(f"refused to {transition}: {said}")
 
-    # What is owed --------------------------------------------------------------------------
+    # Restoring ----------------------------------------------------------------------------
 
-    def owe(self, **owed: Any) -> None:
-        """Note what is to be given back, before it is taken: ``active`` nodes, ``gains``."""
-        self.owed = owed
-        if self._guarded and self._guard is None and owed:
+    def set_pending_restore(self, **pending_restore: Any) -> None:
+        """Note the state to restore, before it is changed: ``active`` nodes and ``gains``."""
+        self.pending_restore = pending_restore
+        if self._guarded and self._guard is None and pending_restore:
             self._guard = Guard(self._arguments)
         if self._guard is not None:
-            self._guard.note(owed)
+            self._guard.note(pending_restore)
 
-    def give_back(self, owed: Mapping[str, Any]) -> None:
-        """Set gains as they were and activate the controllers that were active."""
-        if owed.get("gains"):
-            self.set_parameters(owed["gains"])
-        if owed.get("active"):
-            wheels = [node.partition("/")[0] for node in owed["active"]]
-            # Who excites them ends too: never two that command one wheel.
-            self.until(lambda: not any(map(self.strangers, wheels)), 2.0)
-            self.change_states(owed["active"], "activate")
+    def restore(self, pending_restore: Mapping[str, Any]) -> None:
+        """Set the previous gains and activate the controllers that were active."""
+        if pending_restore.get("gains"):
+            self.set_parameters(pending_restore["gains"])
+        if pending_restore.get("active"):
+            wheels = [node.partition("/")[0] for node in pending_restore["active"]]
+            # Wait until other commanding nodes have ended.
+            self.until(lambda: not any(map(self.find_other_commanders, wheels)), 2.0)
+            self.change_states(pending_restore["active"], "activate")
 
-    def strangers(self, wheel: str) -> list[str]:
-        """Return who commands a wheel, beside its controller and this client."""
+    def find_other_commanders(self, wheel: str) -> list[str]:
+        """Return the nodes that command a wheel, without its controller and this client."""
         known = {"wheel_pid", self._name}
         return [name for name in self._commanders(wheel) if name not in known]
 
     def _commanders(self, wheel: str) -> list[str]:
-        topic = self._full(f"{wheel}/motor_command")
+        topic = self._absolute_name(f"{wheel}/motor_command")
         return [info.node_name for info in self.node.get_publishers_info_by_topic(topic)]
 
     @contextlib.contextmanager
     def paused(self, wheels: Sequence[str]) -> Any:
-        """Deactivate the wheels' active controllers inside the block, and see the wheels free."""
+        """Deactivate the wheels' controllers inside the block; ensure that they are free."""
         owners: dict[str, str] = {}
 
         def take(wheel: str, message: String) -> None:
             owners[wheel] = message.data
 
         with self.listen_to_wheels(String, "motor_owner", wheels, take, LATCHED):
-            # What is discovered together with the wheel is not so at one instant.
-            self.spin(DISCOVERY)
-            self.until(lambda: all(self._found(w, w in owners) for w in wheels), PATIENCE)
+            # The endpoints of one node are discovered one after the other.
+            self.spin(DISCOVERY_S)
+            self.until(lambda: all(self._is_discovered(w, w in owners) for w in wheels), TIMEOUT_S)
             for wheel in wheels:
-                if rival := self.strangers(wheel):
+                if rival := self.find_other_commanders(wheel):
                     raise RobotError(
-                        f"{self._full(wheel)}/motor_command: {', '.join(rival)} commands the "
-                        "wheel, and is no wheel_pid that can be paused; end it first"
+                        f"{self._absolute_name(wheel)}/motor_command: {', '.join(rival)} commands "
+                        "the wheel and cannot be paused; end it first"
                     )
-            nodes = [controller_of(w) for w in wheels if self._controlled(w, owners.get(w, ""))]
+            nodes = [controller_of(w) for w in wheels if self._has_controller(w, owners.get(w, ""))]
             active = [node for node, state in self.get_states(nodes).items() if state == "active"]
-            self.owe(active=active)
+            self.set_pending_restore(active=active)
             self.change_states(active, "deactivate")
-            # The driver's word: whoever commands a wheel holds it until its lease ends.
-            if not self.until(lambda: not any(owners.values()), PATIENCE):
-                held = ", ".join(f"{self._full(w)} by {name}" for w, name in owners.items() if name)
-                raise RobotError(f"still driven after {PATIENCE:g} s: {held}; end it first")
+            # A node owns a wheel until its lease ends.
+            if not self.until(lambda: not any(owners.values()), TIMEOUT_S):
+                held = ", ".join(
+                    f"{self._absolute_name(w)} by {name}" for w, name in owners.items() if name
+                )
+                raise RobotError(f"still driven after {TIMEOUT_S:g} s: {held}; end it first")
         try:
             yield
         finally:
-            self.give_back(self.owed)
-            self.owe()
+            self.restore(self.pending_restore)
+            self.set_pending_restore()
 
-    def _found(self, wheel: str, owner_known: bool) -> bool:
-        """Whether discovery is whole: every writer has its name, and the driver said who drives."""
-        if UNKNOWN in self._commanders(wheel):
+    def _is_discovered(self, wheel: str, owner_known: bool) -> bool:
+        """Return whether all writers are named and the driver has published the owner."""
+        if UNKNOWN_NODE in self._commanders(wheel):
             return False
         return owner_known or self.node.count_publishers(f"{wheel}/motor_owner") == 0
 
-    def _controlled(self, wheel: str, owner: str) -> bool:
-        """Whether a controller is there, by the graph or the driver."""
+    def _has_controller(self, wheel: str, owner: str) -> bool:
+        """Return whether the graph or the driver shows a controller of the wheel."""
         return "wheel_pid" in self._commanders(wheel) or "/wheel_pid#" in owner

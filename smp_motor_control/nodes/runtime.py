@@ -1,9 +1,9 @@
-"""What all nodes share: start, spin, stop with a zero command; QoS, timers, stamps and health.
+# SPDX-License-Identifier: Apache-2.0
+"""Start, spin and stop of nodes; QoS, timers, stamps and diagnostics.
 
-A node's ``main`` is ``partial(run, "name", TheNode)``.  The node may define
-``on_stop()``, which :func:`run` calls before it destroys the node whatever the reason of
-leaving: SIGINT, SIGTERM, SIGQUIT, SIGHUP (a closed terminal), :func:`finish`, or an exception in
-a callback.
+A node's ``main`` is ``partial(run, "name", TheNode)``.  :func:`run` calls the node's ``on_stop()``,
+if defined, before it destroys the node for any reason: SIGINT, SIGTERM, SIGQUIT, SIGHUP (a closed
+terminal), :func:`finish`, or an exception in a callback.
 """
 
 import os
@@ -29,32 +29,31 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.signals import SignalHandlerOptions
 from rclpy.timer import Timer
 
-from smp_motor_control.entry import interrupted
+from smp_motor_control.entry import was_interrupted_on_import
 from smp_motor_control.errors import SmpError
 from smp_motor_control.nodes.executor import LeanExecutor
 
 OK, WARN, ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR
 
-# REP-2003: streams are published reliably and taken best effort, so that both a stock
-# reliable subscriber and a stock best-effort publisher find a partner in our nodes.
-# No lease of liveliness is offered: what keeps it can lock up with the end of another process
-# (docs/decisions/when-a-wheel-stops.md).
+# REP-2003: reliable publishers and best-effort subscribers are compatible with any other node.
+# No liveliness lease is offered: it can lock up when another process ends (see the decision
+# docs/decisions/when-a-wheel-stops.md).
 STREAM_PUBLISHER = QoSProfile(depth=5, reliability=ReliabilityPolicy.RELIABLE)
-"""Commands, states, set-points: what is outdated by the next message."""
+"""Commands, states and set-points, which the next message replaces."""
 
 STREAM_SUBSCRIBER = QoSProfile(depth=5, reliability=ReliabilityPolicy.BEST_EFFORT)
-"""The other end of :data:`STREAM_PUBLISHER`, and of any stock publisher."""
+"""Subscriber of :data:`STREAM_PUBLISHER` and of any other publisher."""
 
 LATCHED = QoSProfile(
     depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL
 )
-"""Descriptions: the last one is kept for whoever comes late."""
+"""Descriptions; late subscribers get the last one."""
 
 _SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGQUIT, signal.SIGHUP)
 
 
 class _Stop:
-    """Why and when to leave the spin, for nodes and for the signal thread."""
+    """Stop request of nodes and of the signal thread."""
 
     def __init__(self) -> None:
         self.requested = threading.Event()
@@ -68,15 +67,15 @@ class _Stop:
             self.wake()
 
     def watch_signals(self) -> None:
-        """Let signals request the stop, whatever the main thread is waiting in.
+        """Let signals request the stop while the main thread waits.
 
-        Python runs handlers in the main thread, which DDS may keep waiting; the C handler
-        below it writes to a pipe at once, and a thread reads that.
+        Python runs handlers in the main thread, which may be blocked in DDS; the C handler writes
+        to a pipe, which a thread reads.
         """
         inlet, outlet = os.pipe()
         os.set_blocking(outlet, False)
         for number in _SIGNALS:
-            # nohup asks to live on without a terminal.
+            # nohup ignores SIGHUP.
             if number != signal.SIGHUP or signal.getsignal(number) is not signal.SIG_IGN:
                 signal.signal(number, lambda *_: None)
         signal.set_wakeup_fd(outlet, warn_on_full_buffer=False)
@@ -85,9 +84,9 @@ class _Stop:
     def _read_signals(self, inlet: int) -> None:
         asked = False
         while number := os.read(inlet, 1):
-            if number[0] not in _SIGNALS:  # such as SIGCONT, handled by a node itself
+            if number[0] not in _SIGNALS:  # such as SIGCONT, handled by a node
                 continue
-            # Who asks twice does not want to wait; a terminal that closes just says it twice.
+            # A second signal exits at once, except SIGHUP, which a closing terminal sends twice.
             if asked and number[0] != signal.SIGHUP:
                 os._exit(1)
             asked = True
@@ -98,17 +97,17 @@ _stop = _Stop()
 
 
 def finish(exit_code: int = 0) -> None:
-    """End the node after the present callback, as a node that has done its work does."""
+    """End the node after the present callback."""
     _stop.request(exit_code)
 
 
 def run(name: str, make: Callable[[], Node], argv: list[str] | None = None) -> int:
-    """Start a node, spin it until a signal, and stop it cleanly; return the exit code."""
+    """Run a node until a signal and stop it cleanly; return the exit code."""
     global _stop
     _stop = stop = _Stop()
-    # rclpy's own handlers would shut the context down, and with it the way to send a zero.
+    # rclpy's own handlers would shut down the context before the final zero command.
     stop.watch_signals()
-    if interrupted():
+    if was_interrupted_on_import():
         return 0
     arguments = [name, *(sys.argv[1:] if argv is None else argv)]
     node: Node | None = None
@@ -144,7 +143,7 @@ _USAGE_ERRORS = (
 
 
 def _init(arguments: list[str]) -> None:
-    """Initialise rclpy without the second telling, on standard error, of what it raises."""
+    """Initialise rclpy without its duplicate error output."""
     sys.stderr.flush()
     kept = os.dup(2)
     with open(os.devnull, "wb") as nowhere:
@@ -170,7 +169,7 @@ def _spin(node: Node, stop: _Stop) -> int:
 
 
 def _one_line(text: str) -> str:
-    """Return what a message of rcl says, without where in its sources it says so."""
+    """Return a message of rcl in one line, without its source location."""
     return " ".join(re.sub(r", at /?\S+:\d+", "", text).split())
 
 
@@ -189,10 +188,7 @@ def _close(node: Node | None) -> None:
 
 
 def refuse_impossible_transitions(node: LifecycleNode) -> None:
-    """Answer a request for a transition that the present state does not have, and live on.
-
-    rclpy raises in the service's callback instead, which ends the node.
-    """
+    """Refuse invalid transitions; rclpy would raise in the service callback and end the node."""
     service = node._service_change_state
     change = service.callback
 
@@ -208,20 +204,20 @@ def refuse_impossible_transitions(node: LifecycleNode) -> None:
 
 
 def send_last(publisher: Publisher, message: Any) -> None:
-    """Publish a last message and wait until those who take it reliably have it."""
+    """Publish a last message and wait until reliable subscribers acknowledge it."""
     publisher.publish(message)
     publisher.wait_for_all_acked(Duration(seconds=0.3))
-    # Best-effort readers acknowledge nothing: give the datagram time to leave the process.
+    # Best-effort subscribers do not acknowledge: give the datagram time to leave the process.
     time.sleep(0.02)
 
 
 def steady_timer(node: Node, period: float, callback: Callable[[], None]) -> Timer:
-    """Return a timer that neither simulated nor corrected time can stop."""
+    """Return a timer on the steady clock, independent of ROS time."""
     return node.create_timer(period, callback, clock=Clock(clock_type=ClockType.STEADY_TIME))
 
 
 def nanoseconds(stamp: Any) -> int:
-    """Return a stamp in whole nanoseconds; 0 where none was given."""
+    """Return a stamp in nanoseconds; 0 without a stamp."""
     return int(stamp.sec) * 1_000_000_000 + int(stamp.nanosec)
 
 
@@ -231,7 +227,7 @@ def seconds(stamp: Any) -> float:
 
 
 class Diagnostics:
-    """Publishes a node's health on ``/diagnostics``, every second and at once on a change."""
+    """Publish a node's health on ``/diagnostics`` every second and on changes."""
 
     def __init__(
         self,
@@ -245,7 +241,7 @@ class Diagnostics:
         self._hardware_id = hardware_id
         self._publisher = node.create_publisher(DiagnosticArray, "/diagnostics", 10)
         self._timer = steady_timer(node, 1.0, self._tick)
-        self.due = False  # whether ``assess`` is asked for the report of the second
+        self.due = False  # whether the present report is the periodic one
 
     def _tick(self) -> None:
         self.due = True
@@ -253,7 +249,7 @@ class Diagnostics:
         self.due = False
 
     def destroy(self) -> None:
-        """Fall silent and give the topic back."""
+        """Stop publishing and destroy the publisher."""
         self._node.destroy_timer(self._timer)
         self._node.destroy_publisher(self._publisher)
 
@@ -262,7 +258,7 @@ class Diagnostics:
         clock = self._node.get_clock()
         if clock.ros_time_is_active and clock.now().nanoseconds == 0:
             level = max(level, WARN)
-            message = f"use_sim_time is set, but nothing is heard on /clock; {message}"
+            message = f"use_sim_time is set, but /clock is not published; {message}"
         status = DiagnosticStatus(
             level=level, name=self._name, message=message, hardware_id=self._hardware_id
         )

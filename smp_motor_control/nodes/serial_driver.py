@@ -1,9 +1,9 @@
-"""Drives the motors of a board on a serial line: ``motor_command`` out, ``motor_state`` in.
+# SPDX-License-Identifier: Apache-2.0
+"""Drives the motors of a board on a serial line.
 
-The line protocol is that of :mod:`smp_motor_control.serial_protocol`.  Silence stops both sides:
-a wheel whose commands cease gets 0 V after ``command_timeout``, a board that hears nothing turns
-its motors off, and a board that says nothing is told nothing.  A board that is reset or unplugged
-is found again by its device.
+The protocol is that of :mod:`smp_motor_control.serial_protocol`.  A wheel without commands gets 0 V
+after ``command_timeout``; a board without commands turns its motors off, and nothing is sent to a
+silent board.  A board that is reset or replugged is reconnected by its device.
 """
 
 import array
@@ -26,46 +26,54 @@ from smp_motor_control import serial_protocol as protocol
 from smp_motor_control.encoder import Encoder, wrap
 from smp_motor_control.errors import ParameterError
 from smp_motor_control.fields import described, fixed
-from smp_motor_control.motor.parameters import SUPPLIES, Gearbox
+from smp_motor_control.motor.parameters import SUPPLY_RANGE_V, Gearbox
 from smp_motor_control.nodes import runtime
-from smp_motor_control.nodes.motor_writer import MotorDriver, tell_refused
+from smp_motor_control.nodes.motor_writer import MotorDriver, report_refused_writers
 from smp_motor_control.nodes.settings import Parameters
 
-POLL = 0.002  # interval at which the line is read [s]
-SILENCE = 0.5  # of a board, after which its line is opened again [s]
-COMMANDS = 0.05  # longest interval between two commands to the board [s]; it stops after 0.2 s
-ANSWERS = 0.2  # a board that was not heard for so long is told nothing: it may not read either [s]
-STALE = 0.1  # a command that the line has not taken for so long is dropped [s]
-EMPTY = 0.3  # nominal supplies below which a battery is empty or switched off
-OVERCHARGED = 2.0  # nominal supplies that no battery has: a board that reports more is wrong
-RESET = 1.0  # a board's clock that jumps by more than this was reset, and its counts with it [s]
-DESCRIBED = ("gear_ratio", "counts_per_revolution", "encoder_bits", "supply_voltage", "resistance")
+POLL_PERIOD_S = 0.002
+SILENCE_S = 0.5  # of a board, after which its line is reopened
+COMMAND_PERIOD_S = (
+    0.05  # longest interval between two commands to the board [s]; it stops after 0.2 s
+)
+BOARD_TIMEOUT_S = (
+    0.2  # a board that was not heard for so long is told nothing: it may not read either [s]
+)
+STALE_AFTER_S = 0.1  # age at which an unsent command is dropped
+EMPTY_RATIO = 0.3  # supply over nominal below which a battery is empty or off
+OVERCHARGED_RATIO = 2.0  # supply over nominal above which a board's reading is wrong
+RESET_JUMP_S = 1.0  # jump of the board's clock that shows a reset
+DESCRIBED_FIELDS = (
+    "gear_ratio",
+    "counts_per_revolution",
+    "encoder_bits",
+    "supply_voltage",
+    "resistance",
+)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Settings:
     device: str = fixed("/dev/ttyACM0", "Serial device of the board.")
-    baud: int = fixed(115200, "Speed of the line [1/s].")
-    wheel_names: tuple[str, ...] = fixed(WHEELS, "Wheels in the order of the board's motors.")
-    gear_ratio: float = fixed(1.0, "Motor turns of a turn of the wheel.")
-    counts_per_revolution: float = fixed(
-        500.0, "Of the encoder, of a turn of the motor.", minimum=1.0
-    )
+    baud: int = fixed(115200, "Baud rate of the line [1/s].")
+    wheel_names: tuple[str, ...] = fixed(WHEELS, "Wheels in the board's order.")
+    gear_ratio: float = fixed(1.0, "Motor revolutions per wheel revolution.")
+    counts_per_revolution: float = fixed(500.0, "Encoder counts per motor revolution.", minimum=1.0)
     encoder_bits: int = fixed(
-        32, "Width of the board's counter; 0: it never wraps.", minimum=0, maximum=63
+        32, "Width of the board's counter; 0: never wraps.", minimum=0, maximum=63
     )
     supply_voltage: float = fixed(
-        12.0, "Nominal supply [V].", minimum=SUPPLIES[0], maximum=SUPPLIES[1]
+        12.0, "Nominal supply [V].", minimum=SUPPLY_RANGE_V[0], maximum=SUPPLY_RANGE_V[1]
     )
-    resistance: float = described(math.nan, "Of a motor, by ohmmeter [ohm]; NaN: not measured.")
+    resistance: float = described(math.nan, "Measured resistance of a motor [ohm]; NaN: unknown.")
     command_timeout: float = described(
-        0.2, "Silence of a wheel's commands after which it gets 0 V [s].", minimum=0.02,
+        0.2, "Time without a command after which a wheel gets 0 V [s].", minimum=0.02,
         maximum=5.0,
     )  # fmt: skip
 
     def __post_init__(self) -> None:
         if self.baud <= 0 or not hasattr(termios, f"B{self.baud}"):
-            raise ParameterError(f"baud is {self.baud}; no serial line has that speed")
+            raise ParameterError(f"baud is {self.baud}; use a standard rate such as 115200")
         if not self.wheel_names:
             raise ParameterError("wheel_names is empty; name a wheel for each motor of the board")
         check_wheel_names(self.wheel_names)
@@ -78,33 +86,35 @@ class Wheel:
 
     def __init__(self, node: Node, name: str, settings: Settings) -> None:
         self.settings, self.voltage, self.commanded = settings, 0.0, -math.inf
-        description = MotorDescription(**{name: getattr(settings, name) for name in DESCRIBED})
+        description = MotorDescription(
+            **{name: getattr(settings, name) for name in DESCRIBED_FIELDS}
+        )
         timeout = settings.command_timeout
-        self._driver = MotorDriver(node, name, timeout, self._command, description)
+        self._driver = MotorDriver(node, name, timeout, self._on_command, description)
         self.lease = self._driver.lease
         self._gearbox = Gearbox(settings.gear_ratio)
         self._encoder = Encoder(settings.counts_per_revolution, settings.encoder_bits)
         self._angle = 0.0
         self._count: int | None = None
-        self.applied = 0.0  # what was last sent [V]
+        self.applied = 0.0  # last voltage sent [V]
 
-    def _command(self, now: float, voltage: float) -> None:
+    def _on_command(self, now: float, voltage: float) -> None:
         if math.isfinite(voltage):
             self.voltage, self.commanded = voltage, now
 
     def wanted(self, now: float, supply: float) -> float:
-        """Return the voltage to command now [V]: of its own sign, and no more than the supply."""
-        self._driver.tell_owner(now)
+        """Return the voltage to send [V], limited to the supply."""
+        self._driver.publish_owner(now)
         if now - self.commanded > self.settings.command_timeout:
             return 0.0
         return math.copysign(min(abs(self.voltage), supply), self.voltage)
 
     def reset(self) -> None:
-        """Take the next count for where the wheel has been all along."""
+        """Take the next count as the present position."""
         self._count = None
 
     def publish(self, count: int, current: float, supply: float, dt: float, stamp: Any) -> None:
-        """Publish what the board said; the first line after a reset has no speed and is kept."""
+        """Publish a state; the first one after a reset has no speed and is skipped."""
         before, self._count = self._count, count
         if before is None:
             return
@@ -127,48 +137,48 @@ class SerialDriver(Node):
         self._settings = settings = Parameters(self, Settings).settings
         self._wheels = [Wheel(self, name, settings) for name in settings.wheel_names]
         self._fd: int | None = None
-        self._lines = protocol.Lines()
+        self._lines = protocol.LineSplitter()
         self._before: protocol.BoardState | None = None
-        self._heard = self._written = self._opened = -math.inf
+        self._heard_at = self._written_at = self._opened_at = -math.inf
         self._battery = self._supply = settings.supply_voltage
-        self._spoilt = self._resets = self._openings = self._dropped = 0
+        self._damaged = self._resets = self._openings = self._dropped = 0
         self._problem = ""
         self._diagnostics = runtime.Diagnostics(self, self._assess, settings.device)
-        self._timer = runtime.steady_timer(self, POLL, self._tick)
+        self._timer = runtime.steady_timer(self, POLL_PERIOD_S, self._on_timer)
 
-    def _tick(self) -> None:
+    def _on_timer(self) -> None:
         now = time.monotonic()
-        if self._fd is None or now - max(self._heard, self._opened) > SILENCE:
+        if self._fd is None or now - max(self._heard_at, self._opened_at) > SILENCE_S:
             self._open(now)
         if self._fd is None:
             return
         try:
             answered = self._read(now)
-            if answered or now - self._written >= COMMANDS:
+            if answered or now - self._written_at >= COMMAND_PERIOD_S:
                 self._write(now)
         except (OSError, termios.error) as error:
-            self._close(_said(error))
+            self._close(_error_text(error))
 
     def _open(self, now: float) -> None:
-        if now - self._opened < SILENCE:
+        if now - self._opened_at < SILENCE_S:
             return
         self._close("silent" if self._fd is not None else self._problem)
-        self._opened = now
+        self._opened_at = now
         try:
             self._fd = os.open(self._settings.device, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
             self._take_line(self._fd)
         except (OSError, termios.error, ValueError) as error:
-            self._close(_said(error))
+            self._close(_error_text(error))
             return
-        self._lines, self._problem = protocol.Lines(), ""
+        self._lines, self._problem = protocol.LineSplitter(), ""
         self._openings += 1
 
     def _take_line(self, fd: int) -> None:
-        """Make a device our own line, without what an earlier program left in its queues."""
+        """Lock and configure the device and flush its queues."""
         try:
             fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
-            raise OSError(0, "another program has it open; end that one") from None
+            raise OSError(0, "another program has it open; end it first") from None
         tty.setraw(fd)
         mode = termios.tcgetattr(fd)
         mode[4] = mode[5] = getattr(termios, f"B{self._settings.baud}")
@@ -189,30 +199,34 @@ class SerialDriver(Node):
             wheel.reset()
 
     def _read(self, now: float) -> bool:
-        """Publish the lines that came; return whether there was one."""
+        """Publish the received states; return whether there was one."""
         assert self._fd is not None
         try:
             data = os.read(self._fd, 65536)
         except BlockingIOError:
             return False
         if not data:
-            raise OSError(0, "the device is gone")
+            raise OSError(0, "the device is disconnected; plug it in")
         found = False
         for line in self._lines.feed(data):
             try:
                 state = protocol.decode_state(line, len(self._wheels))
             except ParameterError as error:
-                self._spoilt, self._problem = self._spoilt + 1, str(error)
+                self._damaged, self._problem = self._damaged + 1, str(error)
                 continue
-            found, self._heard = True, now
+            found, self._heard_at = True, now
             self._take(state)
         return found
 
     def _take(self, state: protocol.BoardState) -> None:
         before, self._before, self._battery = self._before, state, state.battery
         self._supply = self._usable_supply()
-        dt = math.nan if before is None else (state.clock - before.clock) % protocol.CLOCK * 1e-6
-        if not 0.0 < dt < RESET:
+        dt = (
+            math.nan
+            if before is None
+            else (state.clock - before.clock) % protocol.CLOCK_PERIOD_US * 1e-6
+        )
+        if not 0.0 < dt < RESET_JUMP_S:
             self._resets += before is not None
             self._forget()
             self._before = state
@@ -221,26 +235,26 @@ class SerialDriver(Node):
             wheel.publish(count, current, self._supply, dt, stamp)
 
     def _usable_supply(self) -> float:
-        """Return the supply that limits commands [V]: the nominal one where the board's is none."""
+        """Return the supply that limits commands [V]; the nominal one if the board's is invalid."""
         nominal = self._settings.supply_voltage
-        return self._battery if 0.0 <= self._battery <= OVERCHARGED * nominal else nominal
+        return self._battery if 0.0 <= self._battery <= OVERCHARGED_RATIO * nominal else nominal
 
     def _write(self, now: float) -> None:
-        """Command all motors, unless the board or its line still has the commands of before."""
+        """Send commands to all motors unless the board is silent or the line is still busy."""
         voltages = [wheel.wanted(now, self._supply) for wheel in self._wheels]
-        if self._fd is None or self._before is None or now - self._heard > ANSWERS:
+        if self._fd is None or self._before is None or now - self._heard_at > BOARD_TIMEOUT_S:
             return
         fresh = b""
-        if _unsent(self._fd):
-            if now - self._written < STALE:
+        if _count_unsent_bytes(self._fd):
+            if now - self._written_at < STALE_AFTER_S:
                 return
             termios.tcflush(self._fd, termios.TCOFLUSH)
             self._dropped += 1
-            fresh = b"\n"  # ends what the line had of the dropped command
+            fresh = b"\n"  # terminates the partly sent command
         line = protocol.encode_age(self._before.clock) + protocol.encode_voltages(voltages)
         with contextlib.suppress(BlockingIOError):
             os.write(self._fd, fresh + line)
-            self._written = now
+            self._written_at = now
             for wheel, voltage in zip(self._wheels, voltages):
                 wheel.applied = voltage
 
@@ -248,7 +262,7 @@ class SerialDriver(Node):
         now = time.monotonic()
         values: dict[str, object] = {
             "battery [V]": self._battery,
-            "spoilt lines": self._spoilt,
+            "spoilt lines": self._damaged,
             "resets of the board": self._resets,
             "openings": self._openings,
             "dropped commands": self._dropped,
@@ -256,13 +270,15 @@ class SerialDriver(Node):
             "late commands": sum(wheel.lease.late for wheel in self._wheels),
         }
         leases = zip(self._settings.wheel_names, self._wheels)
-        rivals = tell_refused({name: wheel.lease for name, wheel in leases})
+        rivals = report_refused_writers({name: wheel.lease for name, wheel in leases})
         if self._fd is None:
             return runtime.ERROR, f"{self._settings.device}: {self._problem}", values
-        if now - self._heard > SILENCE:
+        if now - self._heard_at > SILENCE_S:
             return runtime.ERROR, "the board is silent", values
-        if self._supply < EMPTY * self._settings.supply_voltage:
-            found = f"the board reports a supply of {self._supply:g} V: is it switched off?"
+        if self._supply < EMPTY_RATIO * self._settings.supply_voltage:
+            found = (
+                f"the board reports a supply of {self._supply:g} V; is the battery switched off?"
+            )
             return runtime.WARN, found, values
         if self._supply != self._battery and not math.isnan(self._battery):
             return runtime.WARN, self._wrong_supply(), values
@@ -273,38 +289,38 @@ class SerialDriver(Node):
     def _wrong_supply(self) -> str:
         nominal = self._settings.supply_voltage
         return (
-            f"the board reports a supply of {self._battery:g} V, which is no battery's of "
-            f"{nominal:g} V: {nominal:g} V limits the motors; mend the board's divider, or set "
+            f"the board reports a supply of {self._battery:g} V, impossible for a battery of "
+            f"{nominal:g} V, so {nominal:g} V limits the motors; correct the board's divider or "
             "supply_voltage"
         )
 
     def on_stop(self) -> None:
-        """Leave the motors at zero."""
+        """Command zero."""
         if self._fd is not None:
             with contextlib.suppress(OSError, termios.error):
                 self._stop_motors(self._fd)
             self._close("")
 
     def _stop_motors(self, fd: int) -> None:
-        """Send zero past all that waits, and give the line the time that this takes."""
+        """Flush the line, send zero and wait until it is sent."""
         termios.tcflush(fd, termios.TCOFLUSH)
         clock = b"" if self._before is None else protocol.encode_age(self._before.clock)
         os.write(fd, b"\n" + clock + protocol.encode_voltages([0.0] * len(self._wheels)))
-        end = time.monotonic() + STALE
-        while _unsent(fd) and time.monotonic() < end:
-            time.sleep(POLL)
+        end = time.monotonic() + STALE_AFTER_S
+        while _count_unsent_bytes(fd) and time.monotonic() < end:
+            time.sleep(POLL_PERIOD_S)
 
 
-def _unsent(fd: int) -> int:
-    """Return how many bytes the line has not taken yet; 0 where it does not tell."""
+def _count_unsent_bytes(fd: int) -> int:
+    """Return the number of unsent bytes; 0 if unknown."""
     waiting = array.array("i", [0])
     with contextlib.suppress(OSError):
         fcntl.ioctl(fd, termios.TIOCOUTQ, waiting)
     return waiting[0]
 
 
-def _said(error: BaseException) -> str:
-    """Return what an error of the system says, without its number."""
+def _error_text(error: BaseException) -> str:
+    """Return the text of a system error, without its number."""
     return str(error.args[-1] if error.args else error)
 
 

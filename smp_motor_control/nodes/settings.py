@@ -1,13 +1,14 @@
-"""ROS parameters as a frozen dataclass that is replaced as a whole, or not at all.
+# SPDX-License-Identifier: Apache-2.0
+"""ROS parameters as a frozen dataclass that is replaced atomically.
 
-A node describes its parameters once, as :mod:`smp_motor_control.fields` says::
+A node describes its parameters by :mod:`smp_motor_control.fields`::
 
     parameters = Parameters(node, Settings)
     parameters.settings.timeout
 
-A change is validated, as one with all that is set in the same call, before it takes effect;
-a refused one leaves the node as it was and the service call says why.  Relations between values
-are checked by ``__post_init__`` of the settings, which raises ParameterError.
+All parameters of a call are validated together before they take effect; a refused call changes
+nothing and returns the reason.  ``__post_init__`` of the settings checks relations between values
+and raises ParameterError.
 """
 
 import difflib
@@ -23,11 +24,11 @@ from smp_motor_control.fields import Described, parameters_in, settings_of
 
 S = TypeVar("S")
 
-_OF_EVERY_NODE = ("use_sim_time", "start_type_description_service")
+_COMMON_PARAMETERS = ("use_sim_time", "start_type_description_service")
 
 
 def coerce(name: str, value: Any, default: Any) -> Any:
-    """Return a parameter's value in the type of its default."""
+    """Return a parameter's value converted to the type of its default."""
     wanted = type(default)
     if wanted is float and type(value) is int:
         return float(value)
@@ -43,7 +44,7 @@ def coerce(name: str, value: Any, default: Any) -> Any:
 
 
 class Parameters(Generic[S]):
-    """Declares a node's parameters and keeps the ``settings`` made of them."""
+    """Declare a node's parameters and keep the ``settings`` built from them."""
 
     def __init__(
         self,
@@ -69,14 +70,14 @@ class Parameters(Generic[S]):
         check(self.settings)
         for name, entry in self._entries.items():
             value = list(values[name]) if isinstance(values[name], tuple) else values[name]
-            # Given values were validated above; the override would be checked again, worse.
+            # Values are already validated, with better messages than those of rclpy.
             node.declare_parameter(name, value, _descriptor(entry), ignore_override=True)
         node.add_on_set_parameters_callback(self._validate)
         node.add_post_set_parameters_callback(self._replace)
 
     def _warn_of_unknown(self, given: Iterable[str], also_known: tuple[str, ...]) -> None:
         prefixes = tuple(name for name in also_known if name.endswith("."))
-        known = {*self._entries, *also_known, *_OF_EVERY_NODE}
+        known = {*self._entries, *also_known, *_COMMON_PARAMETERS}
         for name in given:
             if name not in known and not name.startswith(("qos_overrides.", *prefixes)):
                 nearest = difflib.get_close_matches(name, self._entries, 1, 0.0)
@@ -90,7 +91,7 @@ class Parameters(Generic[S]):
         try:
             return settings_of(self._type, values)
         except ArithmeticError as error:
-            raise ParameterError(f"the values cannot be computed with: {error}") from error
+            raise ParameterError(f"computation fails with these values: {error}") from error
 
     def _with(self, parameters: Iterable[Parameter]) -> dict[str, Any]:
         mine = (p for p in parameters if p.name in self._entries)
@@ -115,7 +116,7 @@ class Parameters(Generic[S]):
 
 
 def given_parameters(node: Node) -> dict[str, Any]:
-    """Return what the command line, launch and parameter files set for a node."""
+    """Return the parameters that command line, launch and parameter files set for a node."""
     return {name: parameter.value for name, parameter in node._parameter_overrides.items()}
 
 
@@ -123,7 +124,7 @@ def _descriptor(entry: Described) -> msg.ParameterDescriptor:
     descriptor = msg.ParameterDescriptor(
         description=entry.text,
         read_only=entry.read_only,
-        # Types are checked by `coerce`, which takes 1 for 1.0 and says what it wants.
+        # `coerce` checks types: it accepts 1 for 1.0.
         dynamic_typing=True,
     )
     if entry.limited and isinstance(entry.default, float):

@@ -1,4 +1,5 @@
-"""skid_steer: velocity commands of the body to set-points of its wheels, and odometry back."""
+# SPDX-License-Identifier: Apache-2.0
+"""Converts velocity commands of the body to set-points of its wheels and publishes odometry."""
 
 import math
 import time
@@ -13,28 +14,28 @@ from sensor_msgs.msg import Imu, JointState
 from smp_interfaces.msg import MotorState
 from smp_motor_control import joint_of
 from smp_motor_control.body.command import BodyCommand, Verdict
-from smp_motor_control.body.odometry import LEAST_STEP, Odometry
+from smp_motor_control.body.odometry import MIN_STEP_S, Odometry
 from smp_motor_control.body.wheel_travel import WheelFeedback, WheelSample
 from smp_motor_control.nodes import runtime
 from smp_motor_control.nodes.odometry_output import OdometryOutput
-from smp_motor_control.nodes.publishers import PublisherWatch, two_publishers, watched
+from smp_motor_control.nodes.publishers import PublisherWatch, describe_two_publishers, with_watch
 from smp_motor_control.nodes.settings import Parameters
 from smp_motor_control.nodes.skid_steer_settings import Settings
 from smp_motor_control.wheel.stop import StopRule
 
-IMPLAUSIBLE = 4.0
-"""Wheels that seem to turn this many times faster than they can have had their counter reset."""
-FASTEST = 250.0  # what is plausible without a limit [rad/s]
-REPORTED = 1.5  # a command that was refused is reported for so long [s], one report at least
-LOOK = 0.2  # interval at which the publishers of cmd_vel are looked at [s]
-STALL = 3.0
-"""A step so many periods late comes before what was heard meanwhile: that is taken in first."""
+IMPLAUSIBLE_RATIO = 4.0
+"""Wheel speed relative to its maximum that shows a counter reset."""
+DEFAULT_MAX_SPEED = 250.0  # plausible speed without a limit [rad/s]
+REPORT_TIME_S = 1.5  # time for which a refused command is reported, at least once
+LOOK_PERIOD_S = 0.2  # period of checking the publishers of cmd_vel
+STALLED_PERIODS = 3.0
+"""Delay in periods after which a step is skipped once, to process queued messages first."""
 
 _TWISTS = {"geometry_msgs/msg/TwistStamped": TwistStamped, "geometry_msgs/msg/Twist": Twist}
 
 
 class SkidSteerNode(Node):
-    """Takes commands of the body and feedback of the wheels; runs on a steady timer."""
+    """Node of the body, on a steady timer."""
 
     def __init__(self) -> None:
         super().__init__("skid_steer")
@@ -51,7 +52,7 @@ class SkidSteerNode(Node):
         body = robot.effective_separation, robot.left_radius, robot.right_radius
         self._odometry = Odometry(*body, size)
         self._configure(settings)
-        self._given = [(0.0, 0.0), (0.0, 0.0)]  # (linear, angular) of the last two steps
+        self._past_commands = [(0.0, 0.0), (0.0, 0.0)]  # (linear, angular) of the last two steps
         self._share = 1.0
         self._late = False
         self._refused, self._refused_at = "", -math.inf
@@ -70,14 +71,14 @@ class SkidSteerNode(Node):
         self._preferred = TwistStamped if settings.use_stamped_vel else Twist
         self._unheard = ""
         self._listen_to(self._preferred)
-        self._look = runtime.steady_timer(self, LOOK, self._follow_type)
+        self._look = runtime.steady_timer(self, LOOK_PERIOD_S, self._follow_type)
         self._states = {wheel: PublisherWatch() for wheel in wheels}
         for wheel in wheels:
             self.create_subscription(
                 MotorState, f"{wheel}/motor_state", partial(self._on_state, wheel), best_effort
             )
         self.create_subscription(Imu, "imu", self._on_imu, best_effort)
-        self._timer = runtime.steady_timer(self, 1.0 / settings.publish_rate, self._tick)
+        self._timer = runtime.steady_timer(self, 1.0 / settings.publish_rate, self._on_timer)
         self._diagnostics = runtime.Diagnostics(self, self._assess)
 
     def _listen_to(self, kind: type) -> None:
@@ -85,11 +86,11 @@ class SkidSteerNode(Node):
         self._kind = kind
         self._commands = PublisherWatch()
         self._cmd_vel = self.create_subscription(
-            kind, "cmd_vel", watched(self._commands, take), runtime.STREAM_SUBSCRIBER
+            kind, "cmd_vel", with_watch(self._commands, take), runtime.STREAM_SUBSCRIBER
         )
 
     def _follow_type(self) -> None:
-        """Listen to the type of command that is published: a process can have one by topic."""
+        """Subscribe to the published type of cmd_vel; a process can have one type per topic."""
         if self._cmd_vel is None:
             self._listen_to(self._kind)
             return
@@ -97,10 +98,10 @@ class SkidSteerNode(Node):
         there = {_TWISTS[info.topic_type] for info in infos if info.topic_type in _TWISTS}
         others = there - {self._kind}
         if others and (self._kind not in there or self._preferred in others):
-            # The middleware lets the old type go with this round; the new one comes with the next.
+            # The middleware releases the old type in this round; subscribe in the next.
             self.destroy_subscription(self._cmd_vel)
             self._cmd_vel, self._kind = None, others.pop()
-            self.get_logger().info(f"cmd_vel is taken as {self._kind.__name__}")
+            self.get_logger().info(f"cmd_vel is read as {self._kind.__name__}")
             others = there - {self._kind}
         self._unheard = others.pop().__name__ if others else ""
 
@@ -109,7 +110,7 @@ class SkidSteerNode(Node):
         self._robot = robot
         self._linear, self._angular = settings.linear, settings.angular
         self._command.configure(settings.cmd_vel_timeout)
-        self._feedback.max_speed = IMPLAUSIBLE * min(robot.max_wheel_speed, FASTEST)
+        self._feedback.max_speed = IMPLAUSIBLE_RATIO * min(robot.max_wheel_speed, DEFAULT_MAX_SPEED)
         self._hold = settings.hold
         body = robot.effective_separation, robot.left_radius, robot.right_radius
         self._odometry.configure(*body, settings.travel_noise, settings.turn_noise)
@@ -136,15 +137,15 @@ class SkidSteerNode(Node):
     def _on_state(self, wheel: str, message: MotorState, info: Mapping[str, Any]) -> None:
         watch = self._states[wheel]
         restarted = watch.hear(info)
-        if watch.doubled:
-            return  # nobody knows which of them is the wheel
+        if watch.has_two_publishers:
+            return  # the two cannot be distinguished
         stamp = runtime.seconds(message.header.stamp)
         self._unstamped[wheel] = not stamp
         sample = WheelSample(stamp or self._now(), message.position, message.velocity)
         self._feedback.receive(wheel, sample, time.monotonic(), restarted)
 
     def _on_imu(self, message: Imu) -> None:
-        """Take the yaw from the orientation, or integrate the yaw rate where there is none."""
+        """Take the yaw from the orientation or, without one, integrate the yaw rate."""
         now, stamp = time.monotonic(), runtime.seconds(message.header.stamp)
         if message.orientation_covariance[0] != -1.0:
             q = message.orientation
@@ -159,23 +160,25 @@ class SkidSteerNode(Node):
             self._yaw = before + rate * dt if fresh else before
         self._imu_stamp, self._yaw_time = stamp, now
 
-    def _tick(self) -> None:
+    def _on_timer(self) -> None:
         now, stamp = time.monotonic(), self._now()
         settings = self._current.settings
-        late = now - self._last_tick > STALL / settings.publish_rate
+        late = now - self._last_tick > STALLED_PERIODS / settings.publish_rate
         self._late, self._last_tick = late and not self._late, now
         if self._late:
             return
-        # Simulated time, where it is used, runs slower, faster or not at all.
+        # Simulated time may run at any pace.
         dt = min(max(stamp - self._last_stamp, 0.0), 5.0 / settings.publish_rate)
         jumped, self._last_stamp = stamp < self._last_stamp, stamp
-        if dt < LEAST_STEP and not jumped:
+        if dt < MIN_STEP_S and not jumped:
             return
         asked = self._command.at(now)
         if asked is not None:
-            self._drive(asked, max(dt, LEAST_STEP), now)
+            self._drive(asked, max(dt, MIN_STEP_S), now)
         if settings.open_loop:
-            updated = asked is not None and self._odometry.update_open_loop(*self._given[0], dt)
+            updated = asked is not None and self._odometry.update_open_loop(
+                *self._past_commands[0], dt
+            )
         else:
             travel = self._feedback.take(now, settings.feedback_timeout)
             updated = travel is not None and self._odometry.update_from_travel(*travel)
@@ -184,11 +187,11 @@ class SkidSteerNode(Node):
         self._output.publish_joints(self._feedback.latest, stamp)
 
     def _drive(self, asked: tuple[float, float], dt: float, now: float) -> None:
-        """Limit what is asked, hold the heading, and set the wheels."""
+        """Limit the command, correct the heading and publish the set-points."""
         linear, angular = self._limit(asked, dt, now)
         share = self._robot.reachable_share(linear, angular)
         linear, angular = linear * share, angular * share
-        self._given = [(linear, angular), self._given[0]]
+        self._past_commands = [(linear, angular), self._past_commands[0]]
         corrected = self._hold_heading(linear, angular, dt, now)
         left, right = self._robot.reachable_wheel_speeds(linear, corrected)
         self._share = share
@@ -197,11 +200,11 @@ class SkidSteerNode(Node):
         self._setpoints.publish(self._setpoint)
 
     def _limit(self, asked: tuple[float, float], dt: float, now: float) -> tuple[float, float]:
-        """Return the command within the limits of acceleration and jerk, and of the stop rule."""
+        """Return the command limited by acceleration, jerk and the stop rule."""
         self._stop.ask(max(map(abs, asked)), now)
-        if self._stop.overdue(now, self._current.settings.stop_time):
+        if self._stop.is_overdue(now, self._current.settings.stop_time):
             return 0.0, 0.0
-        (v0, w0), (v1, w1) = self._given
+        (v0, w0), (v1, w1) = self._past_commands
         linear = self._linear.limit(asked[0], v0, v1, dt).value
         return linear, self._angular.limit(asked[1], w0, w1, dt).value
 
@@ -215,7 +218,7 @@ class SkidSteerNode(Node):
 
     def _assess(self) -> tuple[bytes, str, dict[str, object]]:
         settings, now = self._current.settings, time.monotonic()
-        (linear, angular), asked = self._given[0], self._command.at(now)
+        (linear, angular), asked = self._past_commands[0], self._command.at(now)
         values: dict[str, object] = {
             "linear velocity": linear,
             "angular velocity": angular,
@@ -232,11 +235,11 @@ class SkidSteerNode(Node):
             return runtime.OK, "idle: no cmd_vel", values
         if self._share < 1.0:
             share = 100.0 * self._share
-            return runtime.OK, f"driving at {share:.0f} % of cmd_vel: wheels at their limit", values
+            return runtime.OK, f"driving at {share:.0f} % of cmd_vel: wheel speed limit", values
         return runtime.OK, "driving", values
 
     def _problems(self, settings: Settings, now: float) -> list[tuple[bytes, str]]:
-        """Return what is wrong, each with its level."""
+        """Return the present problems with their levels."""
         problems = []
         commanded = self._command.at(now) is not None
         silent = self._feedback.silent(now, settings.feedback_timeout)
@@ -247,32 +250,34 @@ class SkidSteerNode(Node):
             )
             problems.append((runtime.ERROR, f"no feedback from {wheels}"))
         for wheel, watch in self._states.items():
-            if watch.doubled:
-                problems.append((runtime.ERROR, two_publishers(self, f"{wheel}/motor_state")))
-        if self._commands.doubled:
-            problems.append((runtime.WARN, two_publishers(self, "cmd_vel")))
+            if watch.has_two_publishers:
+                problems.append(
+                    (runtime.ERROR, describe_two_publishers(self, f"{wheel}/motor_state"))
+                )
+        if self._commands.has_two_publishers:
+            problems.append((runtime.WARN, describe_two_publishers(self, "cmd_vel")))
         told = [f"{wheel}: {what}" for wheel, what in self._feedback.problems.items()]
         told += [
             f"{wheel}: motor_state has no stamp" for wheel, no in self._unstamped.items() if no
         ]
         if told and not settings.open_loop:
             problems.append((runtime.WARN, "; ".join(told)))
-        if now - self._refused_at < REPORTED:
+        if now - self._refused_at < REPORT_TIME_S:
             problems.append((runtime.WARN, f"cmd_vel {self._refused}"))
         if self._unheard:
-            text = f"cmd_vel is also published as {self._unheard}, which is not heard"
+            text = f"cmd_vel is also published as {self._unheard}, which is ignored"
             problems.append((runtime.WARN, text))
-        if commanded and self._command.timed_out(now) and any(self._given[0]):
-            problems.append((runtime.WARN, "cmd_vel timed out, braking"))
+        if commanded and self._command.timed_out(now) and any(self._past_commands[0]):
+            problems.append((runtime.WARN, "cmd_vel timed out: braking"))
         if commanded and not settings.cmd_vel_timeout:
-            text = "cmd_vel_timeout is 0: the body drives on when cmd_vel ceases"
+            text = "cmd_vel_timeout is 0: the body keeps driving when cmd_vel ends"
             problems.append((runtime.WARN, text))
         if settings.heading_hold and now - self._yaw_time > settings.imu_timeout:
             problems.append((runtime.WARN, "heading is not held: no imu"))
         return problems
 
     def on_stop(self) -> None:
-        """Leave the wheels at zero, if they were ever commanded from here."""
+        """Command zero if this node has commanded the wheels."""
         if self._setpoint.velocity:
             self._setpoint.header.stamp = self.get_clock().now().to_msg()
             self._setpoint.velocity = [0.0] * len(self._setpoint.name)

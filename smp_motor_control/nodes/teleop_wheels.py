@@ -1,4 +1,5 @@
-"""teleop_wheels: keys of a terminal to cmd_vel or to single wheels, while they are held."""
+# SPDX-License-Identifier: Apache-2.0
+"""Drives the body or single wheels while keys are held in a terminal."""
 
 import atexit
 import contextlib
@@ -22,7 +23,7 @@ from sensor_msgs.msg import JointState
 from smp_motor_control import WHEELS, check_wheel_names, joint_of
 from smp_motor_control.errors import ParameterError, SmpError
 from smp_motor_control.fields import fixed, nested
-from smp_motor_control.keyboard import Keyboard, Speeds, keys_of
+from smp_motor_control.keyboard import Keyboard, Speeds, parse_keys
 from smp_motor_control.nodes import runtime
 from smp_motor_control.nodes.settings import Parameters
 
@@ -30,19 +31,19 @@ _HIDE_CURSOR, _SHOW_CURSOR = "\x1b[?25l", "\x1b[?25h"
 
 
 class Terminal:
-    """The controlling terminal with keys unechoed and unbuffered.
+    """Controlling terminal with unbuffered keys without echo.
 
-    ``suspend`` is called before Ctrl-Z suspends the process, ``leave`` when the terminal is gone,
-    and ``resume`` after the process was continued.
+    ``suspend`` is called before Ctrl-Z suspends the process, ``leave`` when the terminal is closed
+    and ``resume`` after the process continues.
     """
 
     def __init__(
         self, suspend: Callable[[], None], leave: Callable[[], None], resume: Callable[[], None]
     ) -> None:
         if not sys.stdin.isatty():
-            raise SmpError("standard input is not a terminal: start it in a terminal of its own")
+            raise SmpError("standard input is not a terminal; start it in a terminal")
         if in_background(sys.stdin.fileno()):
-            raise SmpError("runs in the background of its terminal: start it in the foreground")
+            raise SmpError("it runs in the background of its terminal; start it in the foreground")
         self._fd = sys.stdin.fileno()
         self._poll = select.poll()
         self._poll.register(self._fd, select.POLLIN)
@@ -55,23 +56,23 @@ class Terminal:
         signal.signal(signal.SIGCONT, self._on_continue)
 
     def take(self) -> None:
-        """Get keys one by one from now on."""
+        """Switch the terminal to unbuffered input."""
         tty.setcbreak(self._fd)
         self._ours = True
         self.write(_HIDE_CURSOR)
 
     def restore(self) -> None:
-        """Give the terminal back as it was; as often as wanted."""
+        """Restore the terminal's settings; repeated calls have no effect."""
         if not self._ours:
             return
         self._ours = False
-        # A terminal that is gone needs nothing.
+        # The terminal may be closed.
         with contextlib.suppress(termios.error, OSError, ValueError):
             termios.tcsetattr(self._fd, termios.TCSANOW, self._usual)
             self.write(_SHOW_CURSOR + "\r\n")
 
     def read(self) -> str:
-        """Return what was typed since the last call; leaves when the terminal is gone."""
+        """Return the input since the last call; leave when the terminal is closed."""
         events = dict(self._poll.poll(0)).get(self._fd, 0)
         if events & ~select.POLLIN:  # hung up
             self._leave()
@@ -89,7 +90,7 @@ class Terminal:
             sys.stdout.flush()
 
     def write_status(self, text: str) -> None:
-        """Replace the line that the cursor is in."""
+        """Replace the current line."""
         width = shutil.get_terminal_size().columns
         self.write(f"\r{text[: width - 1]}\x1b[K")
 
@@ -100,14 +101,14 @@ class Terminal:
 
     def _on_continue(self, number: int, frame: FrameType | None) -> None:
         if in_background(self._fd):
-            return  # continued by `bg`: it stays silent until it is in the foreground
+            return  # continued by `bg`
         if not self._ours:
             self.take()
         self._resume()
 
 
 def in_background(fd: int) -> bool:
-    """Tell whether another process group has the terminal."""
+    """Return whether another process group has the terminal."""
     return os.tcgetpgrp(fd) != os.getpgrp()
 
 
@@ -123,8 +124,8 @@ teleop_wheels: hold a key to drive; the wheels stop {timeout:g} s after it is re
   + -  faster, slower   m  body or wheel mode   space  stop   x or Ctrl-C  quit
 
 """
-ZEROS_AFTER_RELEASE = 1.0
-"""Zero is commanded for so long [s] after a key, then nothing: others may drive."""
+ZERO_TIME_S = 1.0
+"""Time of zero commands after a key; then other nodes may drive."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -134,16 +135,16 @@ class Settings:
     use_stamped_vel: bool = fixed(True, "Publish TwistStamped (true) or Twist (false).")
     frame_id: str = fixed("base_link", "Frame of a stamped command.")
 
-    wheel_names: tuple[str, ...] = fixed(WHEELS, "Wheels that the keys 1, 2, ... select.")
+    wheel_names: tuple[str, ...] = fixed(WHEELS, "Wheels selected by the keys 1, 2, ...")
 
     def __post_init__(self) -> None:
         if not 1 <= len(self.wheel_names) <= 9:
-            raise ParameterError(f"wheel_names has {len(self.wheel_names)} names; 1 to 9 have keys")
+            raise ParameterError(f"wheel_names has {len(self.wheel_names)} names; give 1 to 9")
         check_wheel_names(self.wheel_names)
 
 
 class TeleopWheels(Node):
-    """Reads keys on a steady timer and publishes while one is held, and a little longer."""
+    """Read keys on a steady timer and publish commands until shortly after release."""
 
     def __init__(self) -> None:
         super().__init__("teleop_wheels")
@@ -159,10 +160,10 @@ class TeleopWheels(Node):
         qos = runtime.STREAM_PUBLISHER
         self._twists = self.create_publisher(type(self._twist), "cmd_vel", qos)
         self._setpoints = self.create_publisher(JointState, "wheel_setpoints", qos)
-        self._quiet_from = {True: 0.0, False: 0.0}  # by mode: when its zeros may end
+        self._quiet_from = {True: 0.0, False: 0.0}  # end of the zero commands by mode
         self._terminal = Terminal(self._halt, runtime.finish, self._show_help)
         self._show_help()
-        self._timer = runtime.steady_timer(self, 1.0 / self._settings.rate, self._tick)
+        self._timer = runtime.steady_timer(self, 1.0 / self._settings.rate, self._on_timer)
 
     def _configure(self, settings: Settings) -> None:
         self._settings = settings
@@ -172,16 +173,16 @@ class TeleopWheels(Node):
         wheels = "  ".join(f"{k} {wheel}" for k, wheel in enumerate(self._wheels, start=1))
         self._terminal.write(HELP.format(timeout=self._settings.speeds.timeout, wheels=wheels))
 
-    def _tick(self) -> None:
+    def _on_timer(self) -> None:
         keyboard, now = self._keyboard, time.monotonic()
-        for key in keys_of(self._terminal.read()):
+        for key in parse_keys(self._terminal.read()):
             keyboard.press(key, now)
         if keyboard.quitting:
             runtime.finish()
             return
         if keyboard.driving(now):
-            self._quiet_from[keyboard.body_mode] = now + ZEROS_AFTER_RELEASE
-        # The other mode may still owe its zeros, when the mode was changed while driving.
+            self._quiet_from[keyboard.body_mode] = now + ZERO_TIME_S
+        # After a change of mode while driving, the other mode still sends its zeros.
         for body_mode, until in self._quiet_from.items():
             if now < until:
                 self._publish(body_mode, now)
@@ -226,11 +227,11 @@ class TeleopWheels(Node):
             chosen = "all" if every else min(keyboard.selected)
             line = f"wheel mode  {keyboard.scale * speeds.wheel:.2f} rad/s  {chosen}  | {state}"
             if takers and self.count_publishers(self._setpoints.topic_name) > 1:
-                line += "  (skid_steer commands the wheels too: use body mode)"
-        self._terminal.write_status(line if takers else f"{line}  (nobody listens)")
+                line += "  (skid_steer also commands the wheels: use body mode)"
+        self._terminal.write_status(line if takers else f"{line}  (no subscriber)")
 
     def _halt(self) -> None:
-        """Command zero now to all that was driven from here."""
+        """Command zero to all that this node has driven."""
         self._keyboard.press(" ", time.monotonic())
         if self._quiet_from[False]:
             self._send_wheels([0.0] * len(self._wheels))
@@ -241,7 +242,7 @@ class TeleopWheels(Node):
             runtime.send_last(self._setpoints, self._setpoint)
 
     def on_stop(self) -> None:
-        """Give the terminal back, which cannot fail or wait, and stop what was driven."""
+        """Restore the terminal and command zero."""
         self._terminal.restore()
         self._halt()
 

@@ -1,4 +1,5 @@
-"""``--help`` of the nodes: what a node does, and its parameters."""
+# SPDX-License-Identifier: Apache-2.0
+"""``--help`` of the nodes: description and parameters."""
 
 import contextlib
 import importlib
@@ -9,7 +10,7 @@ from smp_motor_control.fields import parameters_in
 
 
 def main() -> int:
-    """Print the help of the node whose module is the argument."""
+    """Print the help of the node in the module given as argument."""
     module = importlib.import_module(sys.argv[1])
     name = sys.argv[1].rpartition(".")[2]
     usage = f"{name} [--ros-args [-r __ns:=/NAMESPACE] [-p NAME:=VALUE] [--params-file FILE]]"
@@ -21,5 +22,5 @@ def main() -> int:
     with contextlib.suppress(BrokenPipeError):
         print("\n".join(lines), flush=True)
         return 0
-    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # the reader has gone
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # the reader has closed the pipe
     return 0

@@ -1,8 +1,9 @@
-"""Controls the speed of one wheel: set-points and feedback in, volts out.
+# SPDX-License-Identifier: Apache-2.0
+"""Controls the speed of one wheel.
 
-A lifecycle node that starts by itself.  It answers every ``motor_state`` with one step of
-:class:`~smp_motor_control.wheel.controller.WheelController` and one ``motor_command``;
-``~/reset`` releases a wheel that is latched by a fault.
+A lifecycle node that activates itself by default.  It answers every ``motor_state`` with one step
+of :class:`~smp_motor_control.wheel.controller.WheelController` and one ``motor_command``.  The
+service ``~/reset`` releases a wheel that is latched by a fault.
 """
 
 import contextlib
@@ -27,7 +28,7 @@ from smp_motor_control.fields import fixed, nested
 from smp_motor_control.motor.parameters import Gearbox
 from smp_motor_control.nodes import runtime
 from smp_motor_control.nodes.motor_writer import MotorWriter
-from smp_motor_control.nodes.publishers import PublisherWatch, watched
+from smp_motor_control.nodes.publishers import PublisherWatch, with_watch
 from smp_motor_control.nodes.settings import Parameters
 from smp_motor_control.nodes.wheel_report import WheelReport, pid_state
 from smp_motor_control.wheel.controller import WheelController, WheelSettings
@@ -35,18 +36,18 @@ from smp_motor_control.wheel.controller import WheelController, WheelSettings
 
 @dataclass(frozen=True, kw_only=True)
 class Settings:
-    joint_name: str = fixed("", "Joint to control; empty for <namespace>_wheel_joint.")
-    autostart: bool = fixed(True, "Configure and activate without being asked to.")
+    joint_name: str = fixed("", "Joint to control; empty: <namespace>_wheel_joint.")
+    autostart: bool = fixed(True, "Configure and activate at start.")
     wheel: WheelSettings = nested(WheelSettings())
     scheduling_priority: int = fixed(
-        0, "SCHED_FIFO priority; 0 for the usual scheduler.", minimum=0, maximum=99
+        0, "SCHED_FIFO priority; 0: normal scheduler.", minimum=0, maximum=99
     )
-    cpu_affinity: tuple[int, ...] = fixed((-1,), "Processors to run on; -1 for any.")
+    cpu_affinity: tuple[int, ...] = fixed((-1,), "Processors to run on; -1: any.")
 
 
-_WATCH_PERIOD = 0.02
-_SELDOM = 10
-_DONE = TransitionCallbackReturn.SUCCESS
+_TIMER_PERIOD_S = 0.02
+_SLOW_TICKS = 10
+_SUCCESS = TransitionCallbackReturn.SUCCESS
 
 
 class WheelPid(LifecycleNode):
@@ -55,80 +56,81 @@ class WheelPid(LifecycleNode):
         runtime.refuse_impossible_transitions(self)
         self._wheel = wheel = WheelController(WheelSettings())
         check = lambda settings: wheel.check(settings.wheel)  # noqa: E731
-        self._given = Parameters(self, Settings, self._change, check=check)
+        self._given = Parameters(self, Settings, self._on_change, check=check)
         settings = self._given.settings
         self._robot, _, name = self.get_namespace().rpartition("/")
         self._joint = settings.joint_name or joint_of(name)
         if self._joint == joint_of(""):
             raise ParameterError(
-                "wheel_pid needs joint_name, or a wheel's namespace: -r __ns:=/front_left"
+                "joint_name is empty; set it, or a wheel's namespace: -r __ns:=/front_left"
             )
-        self._change(settings)
+        self._on_change(settings)
         self._entities: list[Any] = []
         self._watches = 0
         self._now, self._watched = time.time_ns, False
 
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Create topics, the reset service and diagnostics."""
+        """Create topics, reset service and diagnostics."""
         heard = runtime.STREAM_SUBSCRIBER
         self._writer = MotorWriter(self)
         self._shown = self.create_publisher(PidState, "pid_state", runtime.STREAM_PUBLISHER)
         listen = self.create_subscription
         self._states, self._setpoints = PublisherWatch(), PublisherWatch()
-        asked = watched(self._setpoints, self._ask)
+        asked = with_watch(self._setpoints, self._on_setpoint)
         self._entities = [
             (MotorWriter.destroy, self._writer),
             (self.destroy_publisher, self._shown),
-            (self.destroy_subscription, listen(MotorState, "motor_state", self._hear, heard)),
+            (self.destroy_subscription,
+             listen(MotorState, "motor_state", self._on_motor_state, heard)),
             (self.destroy_subscription,
              listen(JointState, f"{self._robot}/wheel_setpoints", asked, heard)),
             (self.destroy_subscription,
-             listen(MotorDescription, "motor_description", self._describe, runtime.LATCHED)),
-            (self.destroy_service, self.create_service(Trigger, "~/reset", self._reset)),
-            (self.destroy_timer, runtime.steady_timer(self, _WATCH_PERIOD, self._watch)),
+             listen(MotorDescription, "motor_description", self._on_description, runtime.LATCHED)),
+            (self.destroy_service, self.create_service(Trigger, "~/reset", self._on_reset)),
+            (self.destroy_timer, runtime.steady_timer(self, _TIMER_PERIOD_S, self._on_timer)),
         ]  # fmt: skip
         watches = {"motor_state": self._states, f"{self._robot}/wheel_setpoints": self._setpoints}
         self._report = WheelReport(self, self._wheel, self._joint, watches)
-        return _DONE
+        return _SUCCESS
 
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Answer feedback from now on; the wheel waits for its first set-point."""
+        """Start answering feedback."""
         affinity = tuple(cpu for cpu in self.settings.cpu_affinity if cpu >= 0)
         priority = self.settings.scheduling_priority
-        self._report.timekeeping = keep_time(self, priority, affinity)
+        self._report.timekeeping = request_real_time(self, priority, affinity)
         self._wheel.activate(time.monotonic())
         self._report.update()
         return super().on_activate(state)
 
     def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Send a zero command and fall silent."""
+        """Send a zero command and stop answering feedback."""
         self.on_stop()
         return super().on_deactivate(state)
 
     def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Destroy what was configured, after a zero command."""
+        """Send a zero command and destroy all entities."""
         self.on_stop()
         if self._entities:
             self._report.close()
         for destroy, entity in self._entities:
             destroy(entity)
         self._entities = []
-        return _DONE
+        return _SUCCESS
 
     on_shutdown = on_error = on_cleanup
 
     def on_stop(self) -> None:
-        """Send a zero command, as before the process ends."""
+        """Send a zero command."""
         if self._wheel.active:
             self._wheel.deactivate()
             self._writer.stop()
             self._report.update()
 
-    def _change(self, settings: Settings) -> None:
+    def _on_change(self, settings: Settings) -> None:
         self.settings = settings
         self._wheel.configure(settings.wheel)
 
-    def _describe(self, message: MotorDescription) -> None:
+    def _on_description(self, message: MotorDescription) -> None:
         try:
             gearbox = Gearbox(message.gear_ratio)
             encoder = Encoder(message.counts_per_revolution, message.encoder_bits)
@@ -136,14 +138,14 @@ class WheelPid(LifecycleNode):
         except ParameterError as error:
             self._wheel.refuse(f"motor_description: {error}")
 
-    def _reset(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+    def _on_reset(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         fault = self._wheel.recovery.fault
         self._wheel.reset(time.monotonic())
         response.success = True
-        response.message = fault.value if fault else "there was no fault"
+        response.message = fault.value if fault else "the wheel has no fault"
         return response
 
-    def _ask(self, message: JointState) -> None:
+    def _on_setpoint(self, message: JointState) -> None:
         if self._joint not in message.name:
             return
         index = message.name.index(self._joint)
@@ -155,7 +157,7 @@ class WheelPid(LifecycleNode):
         age = self._now() * 1e-9 - stamp.sec - stamp.nanosec * 1e-9 if given else 0.0
         self._wheel.take_setpoint(message.velocity[index], time.monotonic(), age)
 
-    def _hear(self, message: MotorState, info: Mapping[str, Any]) -> None:
+    def _on_motor_state(self, message: MotorState, info: Mapping[str, Any]) -> None:
         self._states.hear(info)
         wheel, stamp = self._wheel, message.header.stamp
         nanoseconds = runtime.nanoseconds(stamp)
@@ -167,14 +169,14 @@ class WheelPid(LifecycleNode):
         if wheel.state is not self._report.shown:
             self._report.update()
 
-    def _watch(self) -> None:
-        """Look for lost feedback, and now and then for what changes seldom."""
+    def _on_timer(self) -> None:
+        """Check for lost feedback and, less often, for subscribers, clock and publishers."""
         self._watches += 1
-        if self._watches % _SELDOM == 0:
+        if self._watches % _SLOW_TICKS == 0:
             self._watched = self._shown.get_subscription_count() > 0
             simulated = self.get_clock().ros_time_is_active
             self._now = self._ros_now if simulated else time.time_ns
-            self._wheel.doubled = self._states.doubled
+            self._wheel.has_two_publishers = self._states.has_two_publishers
         self._wheel.owner = self._writer.owner
         voltage = self._wheel.tick(time.monotonic())
         if voltage is not None:
@@ -185,11 +187,10 @@ class WheelPid(LifecycleNode):
         return int(self.get_clock().now().nanoseconds)
 
 
-def keep_time(node: Node, priority: int, affinity: tuple[int, ...]) -> list[str]:
-    """Ask the system for what a control loop wants, and do without where it says no.
+def request_real_time(node: Node, priority: int, affinity: tuple[int, ...]) -> list[str]:
+    """Request priority and affinity; return the refusals.
 
-    Freezes what is allocated so far out of the garbage collector's sight and turns the
-    collector off; who calls this collects where it does no harm.
+    Disables the garbage collector; the caller collects when it is safe.
     """
     asked: dict[str, Callable[[int], None]] = {}
     if priority > 0:
@@ -205,7 +206,7 @@ def keep_time(node: Node, priority: int, affinity: tuple[int, ...]) -> list[str]
                 with contextlib.suppress(ProcessLookupError):
                     ask(thread)
         except (OSError, ValueError, OverflowError, AttributeError) as error:
-            refused.append(f"{what} not granted: {error}")
+            refused.append(f"{what} is not granted: {error}")
             node.get_logger().warning(f"{refused[-1]}; running without it")
     gc.collect()
     gc.freeze()
@@ -214,7 +215,7 @@ def keep_time(node: Node, priority: int, affinity: tuple[int, ...]) -> list[str]
 
 
 def _threads() -> list[int]:
-    """Return all threads of this process: a sample comes through those of the middleware."""
+    """Return all threads of this process, including those of the middleware."""
     try:
         return [int(name) for name in os.listdir("/proc/self/task")]
     except OSError:

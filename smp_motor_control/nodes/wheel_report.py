@@ -1,4 +1,5 @@
-"""What ``wheel_pid`` says of its health: its state, and everything out of the ordinary."""
+# SPDX-License-Identifier: Apache-2.0
+"""Diagnostics of ``wheel_pid``."""
 
 import gc
 from collections.abc import Mapping
@@ -8,7 +9,7 @@ from rclpy.node import Node
 
 from smp_interfaces.msg import PidState
 from smp_motor_control.nodes import runtime
-from smp_motor_control.nodes.publishers import PublisherWatch, two_publishers
+from smp_motor_control.nodes.publishers import PublisherWatch, describe_two_publishers
 from smp_motor_control.pid import PidGains
 from smp_motor_control.wheel.controller import State, WheelController
 from smp_motor_control.wheel.freshness import Verdict
@@ -18,29 +19,28 @@ _LEVELS = {
     State.DRIVING: runtime.OK,
     State.INACTIVE: runtime.OK,
     State.TIMED_OUT: runtime.WARN,
-    State.NOT_OURS: runtime.WARN,
+    State.OWNED_ELSEWHERE: runtime.WARN,
     State.ROLLING: runtime.WARN,
 }
 _TERMS = ("p_term", "i_term", "d_term", "feedforward", "unsaturated")
-UNTUNED = (
-    "no gains were given: p is 1 V s/rad, i and d are 0, made for no motor; start it with "
+UNTUNED_TEXT = (
+    "default gains: p is 1 V s/rad, i and d are 0, which suit no particular motor; start it with "
     "--params-file gains.yaml, which tune writes"
 )
 
 
-UNSTAMPED = (
-    "motor_state has no stamp: its arrival counts, and its delay is not seen; the driver must fill "
-    "in the instant of sampling"
+UNSTAMPED_TEXT = (
+    "motor_state has no stamp, so its delay is unknown; the driver must set the time of sampling"
 )
 
 
-def untuned(gains: PidGains) -> bool:
-    """Return whether nobody has given gains."""
+def has_default_gains(gains: PidGains) -> bool:
+    """Return whether the gains are the defaults."""
     return (gains.p, gains.i, gains.d) == (PidGains().p, PidGains().i, PidGains().d)
 
 
 class WheelReport:
-    """Assesses one wheel for ``/diagnostics``, every second and on every change of its state."""
+    """Assess one wheel for ``/diagnostics`` every second and on state changes."""
 
     def __init__(
         self,
@@ -55,86 +55,98 @@ class WheelReport:
         self.shown: State | None = None
         self._log = node.get_logger()
         self._diagnostics = runtime.Diagnostics(node, self._assess, joint)
-        if untuned(wheel.settings.loop.gains):
-            self._log.warning(UNTUNED)
+        if has_default_gains(wheel.settings.loop.gains):
+            self._log.warning(UNTUNED_TEXT)
 
     def close(self) -> None:
         self._diagnostics.destroy()
 
     def update(self) -> None:
-        """Publish at once where the state is a new one."""
+        """Publish at once after a change of state."""
         if self._wheel.state is not self.shown:
             self.shown = self._wheel.state
             if self.shown is State.FAULT:
-                self._log.error(f"{self._state()[1]}; 0 V")
+                self._log.error(f"{self._describe_state()[1]}; 0 V")
             self._diagnostics.publish()
 
     def _totals(self) -> dict[str, int]:
-        """Return how often each thing out of the ordinary has happened since the start."""
+        """Return the number of irregular events since the start, by kind."""
         clock = self._wheel.clock
         usual = (Verdict.FRESH, Verdict.FIRST)
         totals = {v.value: n for v, n in clock.counts.items() if v not in usual}
         return {**totals, "clock jumps": clock.jumps, **self._wheel.refused}
 
-    def _state(self) -> tuple[bytes, str]:
+    def _describe_state(self) -> tuple[bytes, str]:
         wheel = self._wheel
         fault = wheel.recovery.fault
         if fault is not None and wheel.state is not State.INACTIVE:
             ending = "; latched: call ~/reset" if wheel.recovery.latched else ""
             return runtime.ERROR, fault.value + ending
-        more = f" ({wheel.owner})" if wheel.state is State.NOT_OURS else ""
+        more = f" ({wheel.owner})" if wheel.state is State.OWNED_ELSEWHERE else ""
         if wheel.state is State.NO_FEEDBACK and wheel.clock.gap:
             more = (
-                f"; motor_state came {wheel.clock.gap:.3g} s after the one before, and "
-                f"feedback_timeout is {wheel.settings.feedback_timeout:g} s: raise it for feedback "
-                "that is so slow"
+                f"; motor_state came {wheel.clock.gap:.3g} s after the previous one, and "
+                f"feedback_timeout is {wheel.settings.feedback_timeout:g} s: raise it for "
+                "such slow feedback"
             )
         return _LEVELS.get(wheel.state, runtime.ERROR), wheel.state.value + more
 
-    def _swing(self) -> str:
-        """Return what is to be said of a wheel that swings around its set-point."""
+    def _describe_oscillation(self) -> str:
+        """Return the message about an oscillation around the set-point; else nothing."""
         wheel, found = self._wheel, self._wheel.oscillation.found
         if found is None or wheel.state is not State.DRIVING:
             return ""
         rate = 1.0 / wheel.clock.dt if wheel.clock.dt else 0.0
         return (
-            f"the speed swings by {found.amplitude:.2g} rad/s around {wheel.target:.2g} rad/s at "
-            f"{found.frequency:.2g} Hz: the gains are too high for feedback at {rate:.0f} Hz; "
-            f"halve p, i and d, or design them by tune --rate {rate:.0f}"
+            f"the speed oscillates by {found.amplitude:.2g} rad/s around {wheel.target:.2g} rad/s "
+            f"at {found.frequency:.2g} Hz: the gains are too high for feedback at {rate:.0f} Hz; "
+            f"halve p, i and d, or design them with tune --rate {rate:.0f}"
         )
 
-    def _strain(self) -> str:
-        """Return what is to be said of a wheel that turns too slowly for its voltage."""
-        strain = self._wheel.strain
-        if strain is None:
+    def _describe_overload(self) -> str:
+        """Return the message about a wheel under overload; else nothing."""
+        overload = self._wheel.overload
+        if overload is None:
             return ""
         return (
-            f"it gets {strain[0]:.2g} V for {abs(self._wheel.measurement):.2g} rad/s, and "
-            f"{strain[1]:.2g} V would do: a heavy load, or an encoder that loses counts; look at "
-            "both before it overheats"
+            f"the wheel gets {overload[0]:.2g} V for {abs(self._wheel.measurement):.2g} rad/s and "
+            f"should need {overload[1]:.2g} V: a heavy load, or an encoder that loses counts; "
+            "check both before the motor overheats"
         )
 
     def _assess(self) -> tuple[bytes, str, Mapping[str, object]]:
-        level, message = self._state()
+        level, message = self._describe_state()
         totals = self._totals()
         recent = {key: n - self._reported.get(key, 0) for key, n in totals.items()}
         listed = ", ".join(f"{n} x {key}" for key, n in recent.items() if n)
         if listed:
             message = f"{message}; in the last second: {listed}"
             level = max(level, runtime.WARN)
-        advice = [text for text in (self._wheel.advice, self._swing(), self._strain()) if text]
+        advice = [
+            text
+            for text in (
+                self._wheel.advice,
+                self._describe_oscillation(),
+                self._describe_overload(),
+            )
+            if text
+        ]
         if self._wheel.loop.wraps_at:
             advice.append(
-                f"encoder_count wraps at {self._wheel.loop.wraps_at} bits, and motor_description "
-                "says otherwise: set its encoder_bits to that"
+                f"encoder_count wraps at {self._wheel.loop.wraps_at} bits, unlike "
+                "motor_description: correct its encoder_bits"
             )
-        advice += [two_publishers(self._node, t) for t, one in self._watches.items() if one.doubled]
+        advice += [
+            describe_two_publishers(self._node, t)
+            for t, one in self._watches.items()
+            if one.has_two_publishers
+        ]
         if self._wheel.clock.unstamped:
-            advice.append(UNSTAMPED)
+            advice.append(UNSTAMPED_TEXT)
         if advice:
             level = max(level, runtime.WARN)
-        if untuned(self._wheel.settings.loop.gains):
-            advice.append(UNTUNED)
+        if has_default_gains(self._wheel.settings.loop.gains):
+            advice.append(UNTUNED_TEXT)
         if self._diagnostics.due:
             self._reported = totals
             gc.collect()
@@ -153,7 +165,7 @@ class WheelReport:
 
 
 def pid_state(wheel: WheelController, joint: str, stamp: Any) -> PidState:
-    """Return what the controller has just computed, as a message."""
+    """Return the controller's last step as a message."""
     out, reference = wheel.answer, wheel.loop.reference.velocity
     state = PidState(
         setpoint=wheel.target,

@@ -1,7 +1,8 @@
-"""A small, bounded test of wheels whose controllers are paused: a voltage for every sample.
+# SPDX-License-Identifier: Apache-2.0
+"""Bounded test of wheels whose controllers are paused.
 
-Commands answer samples, so that a wheel that no longer reports is no longer driven; whatever
-ends the test, the last command is zero.
+Every sample is answered with a voltage, so that a silent wheel is not driven.  The last command is
+always zero.
 """
 
 import contextlib
@@ -24,32 +25,32 @@ from smp_motor_control.nodes.runtime import LATCHED, seconds
 from smp_motor_control.wheel.protection import Bounds, Protection
 
 Law = Callable[[float], float]
-"""From the time since a phase began [s] to a voltage [V]."""
+"""Voltage [V] by the time since the start of a phase [s]."""
 
 Counter = Callable[[MotorState], float]
 
 
 @dataclass
-class Tape:
-    """What one wheel's hardware reported, a row for each sample."""
+class WheelRecording:
+    """Samples of one wheel."""
 
-    # stamp [s], its age on arrival [s], what had been commanded [V], what
-    # was reported [V], [rad/s], [rad], [counts], and the number of the phase
+    # stamp [s], age on arrival [s], commanded and reported voltage [V], velocity [rad/s],
+    # position [rad], counts, number of the phase
     rows: list[tuple[float, ...]] = field(default_factory=list)
 
     def turned(self, since: int) -> float:
-        """Return by how many counts the wheel has turned since a row."""
+        """Return the counts turned since a row."""
         if len(self.rows) <= since:
             return 0.0
         return abs(self.rows[-1][6] - self.rows[since][6])
 
     def position_problem(self) -> str:
-        """Return what is wrong with the position, and what to do; empty where nothing is."""
+        """Return the fault of the position and its remedy; empty without a fault."""
         samples = [WheelSample(row[0], row[5], row[4]) for row in self.rows]
         if not samples:
             return ""
         travel = WheelTravel(samples[0])
-        # No wheel turns four times as fast as the fastest that its driver reports.
+        # A change of position at four times the largest reported speed is a jump.
         fastest = 4.0 * max(
             (abs(s.velocity) for s in samples if math.isfinite(s.velocity)), default=0
         )
@@ -59,14 +60,14 @@ class Tape:
 
 
 class WheelTest:
-    """The test of some wheels, which the client has paused; all are heard, one or all driven."""
+    """Test of wheels that the client has paused."""
 
     def __init__(
         self, client: RobotClient, counters: Mapping[str, Counter], bounds: Bounds
     ) -> None:
         self._client, self._counters = client, counters
         self._watched = {wheel: Protection(bounds) for wheel in counters}
-        self.tapes = {wheel: Tape() for wheel in counters}
+        self.tapes = {wheel: WheelRecording() for wheel in counters}
         self._commands = dict.fromkeys(counters, 0.0)
         self._laws: Mapping[str, Law] = {}
         self._phase = 0
@@ -75,7 +76,7 @@ class WheelTest:
 
     @contextlib.contextmanager
     def open(self) -> Iterator["WheelTest"]:
-        """Hear and drive inside the block."""
+        """Subscribe and allow commands inside the block."""
         self._writers = {w: MotorWriter(self._client.node, f"{w}/") for w in self.tapes}
         try:
             listen = self._client.listen_to_wheels
@@ -89,14 +90,14 @@ class WheelTest:
     def run(
         self, laws: Mapping[str, Law], duration: float, until: Callable[[], bool] | None = None
     ) -> tuple[int, float]:
-        """Drive wheels for a while, or until something is seen; return phase and time taken."""
+        """Drive wheels for a time or until a condition; return phase number and time taken."""
         self._phase += 1
         self._begun, self._laws = time.monotonic(), laws
         self._client.until(until or (lambda: False), duration)
         taken = time.monotonic() - self._begun
         for wheel in laws:
             if rival := self._writers[wheel].owner:
-                raise RobotError(f"{wheel}: {rival} drives this wheel; end it first")
+                raise RobotError(f"{wheel}: {rival} owns this wheel; end it first")
         return self._phase, taken
 
     def _answer(self, wheel: str, message: MotorState) -> None:
@@ -117,18 +118,18 @@ class WheelTest:
             self._commands[wheel] = 0.0
 
 
-def counter(hardware: Any) -> Counter:
-    """Return what gives total counts; where nothing counts, the motor's angle [rad]."""
+def make_counter(hardware: Any) -> Counter:
+    """Return a function of total counts or, without an encoder, of the motor's angle [rad]."""
     if not hardware.counts_per_revolution:
         return lambda message: float(message.position * hardware.gear_ratio)
     unwrapped = Unwrapper(hardware.encoder_bits)
     return lambda message: float(unwrapped(message.encoder_count))
 
 
-def descriptions(
+def read_descriptions(
     client: RobotClient, wheels: Sequence[str], patience: float
 ) -> dict[str, MotorDescription]:
-    """Return what the hardware says of itself; wheels that say nothing in time are left out."""
+    """Return the descriptions of the wheels that publish one in time."""
     found: dict[str, MotorDescription] = {}
     take = found.__setitem__
     with client.listen_to_wheels(MotorDescription, "motor_description", wheels, take, LATCHED):
@@ -136,8 +137,8 @@ def descriptions(
     return found
 
 
-def battery(client: RobotClient) -> float:
-    """Return what ``battery_state`` says [V]; NaN where nobody does, or it is no supply's."""
+def read_battery(client: RobotClient) -> float:
+    """Return the voltage of ``battery_state`` [V]; NaN without a plausible one."""
     if not client.node.count_publishers("battery_state"):
         return math.nan
     heard: list[float] = []

@@ -1,1 +1,2 @@
-"""References of a speed: within limits, smooth, and as fast as the voltage allows."""
+# SPDX-License-Identifier: Apache-2.0
+"""Speed references that are smooth and within the limits of the drive."""

@@ -1,19 +1,18 @@
-"""Transitions of a speed from one value to another: within limits, smooth, on time.
+# SPDX-License-Identifier: Apache-2.0
+"""Transitions between two speeds, limited in rate or with minimum jerk.
 
-Two kinds of transition lead from the reference's present velocity, acceleration and jerk to a
-new target at rest (acceleration 0):
+Both start from the present velocity, acceleration and jerk and end with acceleration 0.
 
-*Limited*: the fastest that keeps to acceleration and jerk limits.  The acceleration rises
-with the largest jerk, is held, and falls with the largest jerk.
+*Rate limited*: the fastest transition within acceleration and jerk limits.  The acceleration
+rises at maximum jerk, is held, and falls at maximum jerk.
 
-*Minimum jerk*: the polynomial of fifth order in velocity that is fixed by
+*Minimum jerk*: the fifth-order polynomial in velocity that is determined by
 
     v(0) = v0, v'(0) = a0, v''(0) = j0,   v(T) = v1, v'(T) = 0, v''(T) = 0,
 
-of a duration T that is chosen.  From rest it is ``v0 + D (10 s^3 - 15 s^4 + 6 s^5)`` with
-``s = t/T``, ``D = v1 - v0``; its peak acceleration is ``15/8 |D|/T`` at ``s = 1/2`` and its peak
-jerk ``10/sqrt(3) |D|/T^2`` at ``s = (1 -+ 1/sqrt(3))/2``.  Wheels that share T arrive together,
-whatever their own step.
+for a chosen duration T.  From rest it is ``v0 + D (10 s^3 - 15 s^4 + 6 s^5)`` with ``s = t/T``,
+``D = v1 - v0``; its peak acceleration is ``15/8 |D|/T`` at ``s = 1/2`` and its peak jerk
+``10/sqrt(3) |D|/T^2`` at ``s = (1 -+ 1/sqrt(3))/2``.  Wheels with the same T arrive together.
 """
 
 import math
@@ -31,7 +30,7 @@ PEAK_JERK = 10.0 / math.sqrt(3.0)
 
 
 class Reference(NamedTuple):
-    """The reference at one instant."""
+    """Reference at one instant."""
 
     velocity: float  # [rad/s]
     acceleration: float  # [rad/s^2]
@@ -39,13 +38,13 @@ class Reference(NamedTuple):
 
 
 def _limit(name: str, unit: str) -> Any:
-    text = f"Of the reference [{unit}]."
+    text = f"Maximum {name} of the reference [{unit}]."
     return described(math.inf, text, minimum=0.0, name=f"max_{name}", endless=True)
 
 
 @dataclass(frozen=True, kw_only=True)
 class ProfileLimits:
-    """What a reference must keep to; infinite where there is no limit."""
+    """Limits of a reference; infinite means no limit."""
 
     velocity: float = _limit("velocity", "rad/s")
     acceleration: float = _limit("acceleration", "rad/s^2")
@@ -59,12 +58,12 @@ class ProfileLimits:
 
 
 class MinimumJerk:
-    """Polynomial of fifth order from a moving start to a target at rest.
+    """Fifth-order polynomial from a moving start to a constant target.
 
     References
     ----------
     T. Flash and N. Hogan, "The coordination of arm movements", J. Neuroscience 5 (1985),
-    equations 5 and 6: the same polynomial, there of position.
+    equations 5 and 6: the same polynomial in position.
     """
 
     __slots__ = ("_c", "duration", "start", "target")
@@ -85,7 +84,7 @@ class MinimumJerk:
         )
 
     def at(self, t: float) -> Reference:
-        """Return the reference at an instant."""
+        """Return the reference at time ``t`` [s]."""
         if t >= self.duration:
             return Reference(self.target, 0.0, 0.0)
         if t <= 0.0:
@@ -99,8 +98,8 @@ class MinimumJerk:
         )
 
 
-class Limited:
-    """The fastest transition within limits of acceleration and jerk; without either, a jump."""
+class RateLimited:
+    """Fastest transition within limits of acceleration and jerk; without limits, a jump."""
 
     __slots__ = ("_legs", "duration", "target")
 
@@ -114,7 +113,7 @@ class Limited:
             if math.isfinite(largest):
                 self._append(abs(target - v) / largest, v, math.copysign(largest, target - v), 0.0)
             return
-        # Where the velocity comes to rest if the acceleration is taken away now.
+        # Compare with the velocity reached when the acceleration is reduced to zero from now on.
         sign = math.copysign(1.0, target - (v + a * abs(a) / (2.0 * jerk)))
         a *= sign
         step = sign * (target - v)
@@ -133,7 +132,7 @@ class Limited:
         return Reference(v + length * (a + length * j / 2.0), a + length * j, j)
 
     def at(self, t: float) -> Reference:
-        """Return the reference at an instant."""
+        """Return the reference at time ``t`` [s]."""
         begin = 0.0
         for end, v, a, j in self._legs:
             if t < end:
@@ -144,7 +143,7 @@ class Limited:
 
 
 def minimum_jerk_duration(step: float, limits: ProfileLimits, least: float = 0.0) -> float:
-    """Return how long a minimum-jerk transition from rest has to take within limits."""
+    """Return the shortest duration of a minimum-jerk transition from rest within limits [s]."""
     size = abs(step)
     return max(
         least,

@@ -1,4 +1,5 @@
-"""The reference of a wheel as its loop uses it: fed forward now, compared with some time later."""
+# SPDX-License-Identifier: Apache-2.0
+"""Reference of a wheel's loop: fed forward now, compared with the measurement after its lag."""
 
 import math
 from collections import deque
@@ -7,32 +8,32 @@ from smp_motor_control.motor.model import MotorModel
 from smp_motor_control.pid import PidGains
 from smp_motor_control.reference.profile import Profile, Reference
 
-_RECENT = 5
-"""Intervals of which the median is the usual one."""
+_INTERVAL_WINDOW = 5
+"""Number of intervals whose median is the usual one."""
 
-_NO_WEIGHT = 1e-12
-"""Feed-forward of the acceleration that is none; the others are taken in units of it."""
+_MIN_WEIGHT = 1e-12
+"""Acceleration feed-forward below this counts as zero."""
 
 
 class ReferencePath:
-    """Leads the reference of a profile, and remembers where it was."""
+    """Advance the reference of a profile and keep its history."""
 
     def __init__(self, profile: Profile) -> None:
         self.profile = profile
-        self._recent: deque[float] = deque(maxlen=_RECENT)
+        self._recent: deque[float] = deque(maxlen=_INTERVAL_WINDOW)
         self.start(0.0)
 
     def start(self, velocity: float) -> None:
-        """Rest at a velocity."""
+        """Restart at a constant velocity."""
         self.profile.reset(velocity)
-        # At this sample, and at the next one if the interval is as usual
+        # At this sample, and predicted for the next one
         self.now = self.following = self.profile.now
         self._from = velocity
         self._elapsed = 0.0
         self._past: deque[tuple[float, float]] = deque([(0.0, velocity)])
 
     def step(self, setpoint: float, dt: float) -> Reference:
-        """Advance to this sample, and head for the set-point from here."""
+        """Advance to this sample and start a transition to the set-point."""
         profile = self.profile
         self._recent.append(dt)
         self.usual = sorted(self._recent)[len(self._recent) // 2]
@@ -45,8 +46,11 @@ class ReferencePath:
         self._past.append((self._elapsed, self.now.velocity))
         return self.now
 
-    def ago(self, delay: float, doubt: float, measurement: float) -> tuple[float, float]:
-        """Return what a measurement is to be compared with."""
+    def delayed(self, delay: float, doubt: float, measurement: float) -> tuple[float, float]:
+        """Return the reference ``delay`` seconds ago and the value to compare a measurement with.
+
+        The latter is the value within ``delay`` ± ``doubt`` that is closest to the measurement.
+        """
         past, then = self._past, self._elapsed - delay
         while len(past) > 2 and past[1][0] <= then - doubt:
             past.popleft()
@@ -56,54 +60,58 @@ class ReferencePath:
         around = [nominal, *(_interpolated(past, then + x) for x in (-doubt, doubt))]
         return nominal, min(max(measurement, min(around)), max(around))
 
-    def forward(self, compared: float, gains: PidGains, model: MotorModel | None) -> float:
-        """Return the acceleration to feed forward beside a compared reference.
+    def acceleration_feedforward(
+        self, compared: float, gains: PidGains, model: MotorModel | None
+    ) -> float:
+        """Return the acceleration to feed forward together with a compared reference.
 
-        The controller adds ``fv r_d + fa x`` for the reference ``r_d`` that it compares with;
-        with the x below that is the mean of ``fv r + fa (r' + r'' a2 / a1)`` over the interval for
-        which the voltage is held, so that a model that gets it is with the reference at its end.
+        The controller adds ``fv r_d + fa x`` for the compared reference ``r_d``.  With the returned
+        x this is the mean of ``fv r + fa (r' + r'' a2 / a1)`` over the interval of the held
+        voltage, so that the model reaches the reference at its end.
         """
         now, following, dt = self.now, self.following, self.usual
         gained = following.acceleration - now.acceleration
-        forward = (following.velocity - now.velocity) / dt
+        acceleration_feedforward = (following.velocity - now.velocity) / dt
         weight = gains.feedforward_acceleration
-        if abs(weight) < _NO_WEIGHT:
-            return forward
+        if abs(weight) < _MIN_WEIGHT:
+            return acceleration_feedforward
         mean = 0.5 * (now.velocity + following.velocity) - dt / 12.0 * gained
-        forward += gains.feedforward_velocity / weight * (mean - compared)
+        acceleration_feedforward += gains.feedforward_velocity / weight * (mean - compared)
         electrical = 0.0 if model is None else model.time_constant_product / model.time_constant
-        forward += electrical * gained / dt
+        acceleration_feedforward += electrical * gained / dt
         least = gains.feedforward_static / weight
         if not least:
-            return forward
-        forward += least * self._friction(electrical)
-        # The controller adds friction for the reference that it compares with, or, if that is
-        # at rest, for the acceleration that it is given.
+            return acceleration_feedforward
+        acceleration_feedforward += least * self._friction(electrical)
+        # The controller adds friction by the sign of the compared reference or, at zero, of the
+        # acceleration.
         if compared:
-            return forward - math.copysign(least, compared)
-        return math.copysign(max(abs(forward) - least, 0.0), forward)
+            return acceleration_feedforward - math.copysign(least, compared)
+        return math.copysign(
+            max(abs(acceleration_feedforward) - least, 0.0), acceleration_feedforward
+        )
 
     def _friction(self, electrical: float) -> float:
-        """Return the mean voltage against dry friction over the next interval, as a share.
+        """Return the mean friction compensation over the next interval, as a fraction.
 
-        The current follows a turn of the voltage with the electrical time constant.  On the way
-        through zero, and from rest, the share therefore goes along a ramp with what the rate of
-        its current takes, so that as much torque is too early as is too late; from rest a
-        shorter one, for until the current is there friction holds the wheel.
+        The current follows a change of voltage with the electrical time constant.  When the
+        reference passes zero, the compensation is a ramp with the lead of the current, so that
+        torque errors before and after cancel.  From rest the ramp is shorter, as friction holds the
+        wheel until the current has risen.
         """
         now, following = self.now, self.following
         target = self.profile.target
         if self._from * target > 0.0 or not target:
             return _sign(now.velocity or following.velocity)
         half = max((0.5 if self._from else 0.25) * electrical, 0.5 * self.usual)
-        first, last = (_share(each, half) for each in (now, following))
+        first, last = (_friction_share(each, half) for each in (now, following))
         return 0.5 * (first + last) + electrical * (last - first) / self.usual
 
 
-def _share(reference: Reference, half: float) -> float:
-    """Return where the friction's ramp is, from the time to or since the passage of zero.
+def _friction_share(reference: Reference, half: float) -> float:
+    """Return the value of the friction ramp, by the time to or since the zero crossing.
 
-    At its end a change's rate is nothing but rounding, of either sign.
+    At the end of a transition the rate is a rounding error of either sign.
     """
     velocity, rate = reference.velocity, abs(reference.acceleration)
     reach = max(rate * half, abs(velocity))
@@ -115,7 +123,7 @@ def _sign(value: float) -> float:
 
 
 def _interpolated(past: deque[tuple[float, float]], then: float) -> float:
-    """Return a value between remembered ones, linearly; the first before them."""
+    """Interpolate the history linearly, constant before its start."""
     t1, v1 = past[0]
     for t, v in past:
         t0, v0, t1, v1 = t1, v1, t, v

@@ -1,13 +1,14 @@
-"""The reference of a wheel's speed: within its limits, smooth, and on time."""
+# SPDX-License-Identifier: Apache-2.0
+"""Generator of a wheel's speed reference."""
 
 import math
 from collections.abc import Sequence
 
 from smp_motor_control.errors import ParameterError, check_positive
 from smp_motor_control.reference.minimum_jerk import (
-    Limited,
     MinimumJerk,
     ProfileLimits,
+    RateLimited,
     Reference,
     minimum_jerk_duration,
 )
@@ -16,25 +17,25 @@ from smp_motor_control.reference.time_optimal import Drive, VoltageLimited
 __all__ = ["UNLIMITED", "Drive", "Profile", "ProfileLimits", "Reference"]
 
 UNLIMITED = ProfileLimits()
-"""A reference that jumps."""
+"""No limits: the reference jumps."""
 
-_FASTEST = 1e9
-"""Target [rad/s] beyond which nothing turns; squares of it and its rates stay finite."""
+_MAX_TARGET = 1e9
+"""Maximum target [rad/s]; squares of it and its rates stay finite."""
 
-_SHORTEST = 1e-6
-"""Transition time [s] below which a change is as fast as the limits allow."""
+_MIN_TRANSITION_S = 1e-6
+"""Shorter transition times count as zero."""
 
 _STRETCH = 1.1
-_LOOKS = tuple(k / 32.0 for k in range(32))
+_CHECK_POINTS = tuple(k / 32.0 for k in range(32))
 
 
 class Profile:
-    """The reference of one wheel, led from target to target without a jump.
+    """Reference of one wheel, continuous from target to target.
 
-    Every change of the target takes ``transition_time`` [s] along a minimum-jerk polynomial,
-    stretched where a limit asks for it; 0 takes the fastest transition within the limits.  With a
-    ``drive``, a change for which its voltage does not do is made as fast as the voltage allows.
-    Targets beyond the limit of the velocity are clipped.
+    A change of the target takes ``transition_time`` [s] along a minimum-jerk polynomial, stretched
+    to keep the limits; 0 gives the fastest transition within the limits.  With a ``drive``, a
+    change that exceeds its voltage is made as fast as the voltage allows.  Targets are clipped to
+    the velocity limit.
 
     Examples
     --------
@@ -56,65 +57,67 @@ class Profile:
     def configure(
         self, limits: ProfileLimits, transition_time: float, drive: Drive | None = None
     ) -> None:
-        """Change limits and duration from the next change of the target on."""
+        """Change the settings from the next target on."""
         check_positive("transition_time", transition_time, "s", or_zero=True)
         self.limits, self.drive = limits, drive
-        self.transition_time = transition_time if transition_time >= _SHORTEST else 0.0
+        self.transition_time = transition_time if transition_time >= _MIN_TRANSITION_S else 0.0
 
     def reset(self, velocity: float = 0.0) -> None:
-        """Rest at a velocity, such as the measured one when a loop is closed."""
+        """Restart at a constant velocity."""
         self.target = velocity
         self.now = Reference(velocity, 0.0, 0.0)
-        self._transition: MinimumJerk | Limited | VoltageLimited | None = None
+        self._transition: MinimumJerk | RateLimited | VoltageLimited | None = None
         self._elapsed = 0.0
 
     @property
     def duration(self) -> float:
-        """Of the transition that is under way [s]; 0 at rest."""
+        """Duration of the current transition [s]; 0 without one."""
         return 0.0 if self._transition is None else self._transition.duration
 
     def set_target(self, velocity: float, sample_time: float = 0.005) -> None:
-        """Head for a velocity from wherever the reference is now."""
+        """Start a transition from the present reference to a velocity."""
         if not math.isfinite(velocity):
             raise ParameterError(f"target velocity is {velocity}: must be finite")
-        most = min(self.limits.velocity, _FASTEST)
+        most = min(self.limits.velocity, _MAX_TARGET)
         velocity = min(max(velocity, -most), most)
         if velocity == self.target:
             return
         self.target = velocity
         self._elapsed = 0.0
-        self._transition = self._to(velocity, sample_time)
+        self._transition = self._plan_transition(velocity, sample_time)
 
-    def _to(self, target: float, sample_time: float) -> MinimumJerk | Limited | VoltageLimited:
+    def _plan_transition(
+        self, target: float, sample_time: float
+    ) -> MinimumJerk | RateLimited | VoltageLimited:
         limits = self.limits
         if self.drive is not None and math.isinf(min(limits.acceleration, limits.jerk)):
             if self.transition_time > 0.0:
                 smooth = MinimumJerk(self.now, target, self.transition_time)
-                if self._keeps(smooth):
+                if self._is_within_limits(smooth):
                     return smooth
             return VoltageLimited(self.now, target, self.drive, sample_time, self.transition_time)
         if self.transition_time > 0.0 or self.drive is not None:
-            return self._minimum_jerk(target, max(self.transition_time, sample_time))
-        return Limited(self.now, target, limits)
+            return self._plan_minimum_jerk(target, max(self.transition_time, sample_time))
+        return RateLimited(self.now, target, limits)
 
-    def _minimum_jerk(self, target: float, least: float) -> MinimumJerk:
+    def _plan_minimum_jerk(self, target: float, least: float) -> MinimumJerk:
         limits, start = self.limits, self.now
         step = target - start.velocity
         transition = MinimumJerk(start, target, minimum_jerk_duration(step, limits, least))
-        # A start from rest is exact but for the voltage.  A moving start may ask for more: time
-        # helps, but only without the jerk that it started with, which would act all the longer.
-        while not self._keeps(transition):
+        # The duration is exact from rest.  A moving start may need longer, without its initial
+        # jerk, whose effect grows with time.
+        while not self._is_within_limits(transition):
             start = start._replace(jerk=0.0)
             transition = MinimumJerk(start, target, transition.duration * _STRETCH)
         return transition
 
-    def _keeps(self, transition: MinimumJerk) -> bool:
-        """Tell whether acceleration, jerk and voltage keep their limits (to one part in 1000).
+    def _is_within_limits(self, transition: MinimumJerk) -> bool:
+        """Return whether acceleration, jerk and voltage are within limits (to one part in 1000).
 
-        An acceleration that is beyond its limit already, since that was lowered, may only fall.
+        An initial acceleration beyond a lowered limit may only decrease.
         """
-        seen = [transition.at(s * transition.duration) for s in _LOOKS]
-        if self.drive is not None and not self._affords(self.drive, transition, seen):
+        seen = [transition.at(s * transition.duration) for s in _CHECK_POINTS]
+        if self.drive is not None and not self._is_within_voltage(self.drive, transition, seen):
             return False
         largest = max(
             1.001 * self.limits.acceleration, (1 + 1e-9) * abs(transition.start.acceleration)
@@ -124,10 +127,13 @@ class Profile:
             and max(abs(x.jerk) for x in seen) <= 1.001 * self.limits.jerk
         )
 
-    def _affords(self, drive: Drive, transition: MinimumJerk, seen: Sequence[Reference]) -> bool:
-        """Tell whether the voltage does; where nothing but the voltage limits, or from rest.
+    def _is_within_voltage(
+        self, drive: Drive, transition: MinimumJerk, seen: Sequence[Reference]
+    ) -> bool:
+        """Return whether the voltage is within the drive's limit.
 
-        Of a transition that starts with an acceleration more time makes more voltage.
+        With an acceleration limit and an initial acceleration the voltage is not checked: more time
+        would raise it.
         """
         if transition.start.acceleration and math.isfinite(self.limits.acceleration):
             return True
@@ -135,7 +141,7 @@ class Profile:
         return max(abs(drive.needed(x)) for x in seen) <= 1.001 * most
 
     def step(self, dt: float) -> Reference:
-        """Advance by one sample."""
+        """Advance by ``dt`` seconds."""
         if self._transition is None:
             return self.now
         self._elapsed += dt
@@ -145,7 +151,7 @@ class Profile:
         return self.now
 
     def ahead(self, lead: float) -> Reference:
-        """Return where the reference will be if the target stays."""
+        """Return the reference ``lead`` seconds ahead for a constant target."""
         if self._transition is None:
             return self.now
         return self._clip(self._transition.at(self._elapsed + lead))

@@ -1,9 +1,9 @@
-"""The fastest change of speed that a voltage allows, in whole samples.
+# SPDX-License-Identifier: Apache-2.0
+"""Time-optimal change of speed under a voltage limit, in whole samples.
 
-A motor obeys ``tp w'' + tau w' + w = u``, where u is the speed that its voltage would hold for
-ever.  Between bounds ``|u| <= U`` the fastest way from one speed to another at rest is u at
-one bound, then at the other (Pontryagin); with u held over samples the same two stretches are
-made of whole samples, and their two values follow exactly from the two end conditions.
+A motor obeys ``tp w'' + tau w' + w = u``, where u is the steady speed at its voltage.  Within
+``|u| <= U`` the fastest transition is u at one bound, then at the other (Pontryagin).  In discrete
+time both phases last whole samples, and the two end conditions determine their values of u.
 
 References
 ----------
@@ -19,24 +19,22 @@ from smp_motor_control.fields import described
 from smp_motor_control.motor.response import FreeResponse
 from smp_motor_control.reference.minimum_jerk import Reference
 
-_EASY = 1.0 + 1e-9
+_ROUNDING_MARGIN = 1.0 + 1e-9
 _BISECTIONS = 60
-_FIRST_ORDER = 1e-6
-"""Product of the time constants, as a share of their sum squared, that counts as none."""
+_MAX_FIRST_ORDER_RATIO = 1e-6
+"""Largest ``tp / tau^2`` of a motor treated as first order."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Drive:
-    """What a motor can do with the voltage that a change of speed may use."""
+    """Speed and time constants of a motor under the voltage available for transitions."""
 
-    # What this voltage, less what dry friction takes, would hold for ever
+    # Steady speed at this voltage, less that of dry friction
     top_speed: float = described(
-        MISSING, "Speed at which the voltage for changes is used up [rad/s]; 0: no limit."
+        MISSING, "Steady speed at the voltage for transitions [rad/s]; 0: no limit."
     )
-    time_constant: float = described(
-        MISSING, "Sum of the time constants that changes are made for [s]."
-    )
-    time_constant_product: float = described(0.0, "Their product [s^2].")
+    time_constant: float = described(MISSING, "Sum of the time constants for transitions [s].")
+    time_constant_product: float = described(0.0, "Product of these time constants [s^2].")
 
     def __post_init__(self) -> None:
         tau = check_range("time_constant of the drive", self.time_constant, 1e-7, 1e5, "s")
@@ -45,7 +43,7 @@ class Drive:
         check_range("time_constant_product of the drive", product, 0.0, most, "s^2")
 
     def needed(self, reference: Reference) -> float:
-        """Return u, the speed that the voltage of an instant would hold for ever."""
+        """Return u, the steady speed at the voltage that a reference needs."""
         bend = self.time_constant_product * reference.jerk
         return reference.velocity + self.time_constant * reference.acceleration + bend
 
@@ -55,11 +53,11 @@ _State = tuple[float, float]
 
 
 class _Motor:
-    """Exact responses to a constant u."""
+    """Exact response to a constant u."""
 
     def __init__(self, drive: Drive) -> None:
         tau, tp = drive.time_constant, drive.time_constant_product
-        self.free = FreeResponse(tau, tp if tp > _FIRST_ORDER * tau * tau else 0.0)
+        self.free = FreeResponse(tau, tp if tp > _MAX_FIRST_ORDER_RATIO * tau * tau else 0.0)
         self.tau, self.tp = tau, self.free.product
 
     def after(self, state: _State, u: float, t: float) -> _State:
@@ -68,27 +66,26 @@ class _Motor:
         g, h, g_rate, h_rate = self.free.after(t)
         return u + g * off + h * a, g_rate * off + h_rate * a
 
-    def until_even(self, state: _State, u: float) -> float:
-        """Return when u, which brakes it, has taken the acceleration away [s]."""
+    def time_to_zero_acceleration(self, state: _State, u: float) -> float:
+        """Return the time until a braking u has reduced the acceleration to zero [s]."""
         w, a = state
         if a == 0.0:
             return 0.0
-        # Some twenty of the slowest time constants leave nothing.
+        # After 20 of the slowest time constants the response has decayed.
         longest = -20.0 / self.free.slow
         turns = self.free.turning_points(w - u, a, longest)
         return turns[0] if turns else longest
 
     def jerk(self, state: _State, u: float) -> float:
-        """Return the change of the acceleration; 0 for a motor of first order."""
+        """Return the jerk; 0 for a first-order motor."""
         w, a = state
         return (u - w - self.tau * a) / self.tp if self.tp else 0.0
 
 
 class VoltageLimited:
-    """The fastest transition within a voltage, of whole samples, of ``least`` seconds in any case.
+    """Fastest transition within a voltage, in whole samples, of at least ``least`` seconds.
 
-    A target at or beyond the top speed is headed for with as much voltage as holding it takes
-    and a fiftieth more.
+    For a target at or beyond the top speed the voltage limit is raised to 1.02 times its need.
     """
 
     __slots__ = ("_legs", "_motor", "duration", "target")
@@ -101,10 +98,12 @@ class VoltageLimited:
         self._motor = motor = _Motor(drive)
         top = max(drive.top_speed, 1.02 * abs(target))
         state = (start.velocity, start.acceleration if motor.tp else 0.0)
-        first, second = _quickest(motor, state, target, top)
+        first, second = _find_switching_times(motor, state, target, top)
         samples = max(math.ceil(max(first + second, least) / sample_time - 1e-6), 1)
         lag = second / sample_time
-        while (legs := _whole(motor, state, target, top, samples, lag, sample_time)) is None:
+        while (
+            legs := _fit_whole_samples(motor, state, target, top, samples, lag, sample_time)
+        ) is None:
             samples += max(1, samples // 16)
         self._legs: list[tuple[float, _State, float]] = []
         self.duration = 0.0
@@ -114,7 +113,7 @@ class VoltageLimited:
             state = motor.after(state, u, length)
 
     def at(self, t: float) -> Reference:
-        """Return the reference at an instant."""
+        """Return the reference at time ``t`` [s]."""
         begin, motor = 0.0, self._motor
         for end, state, u in self._legs:
             if t < end * (1.0 - 1e-12):
@@ -124,22 +123,24 @@ class VoltageLimited:
         return Reference(self.target, 0.0, 0.0)
 
 
-def _quickest(motor: _Motor, state: _State, target: float, top: float) -> tuple[float, float]:
-    """Return the lengths of the two stretches, in continuous time [s]."""
+def _find_switching_times(
+    motor: _Motor, state: _State, target: float, top: float
+) -> tuple[float, float]:
+    """Return the lengths of the two phases in continuous time [s]."""
     speed = state[0]
     if not motor.tp:
         bound = math.copysign(top, target - speed)
         return motor.tau * math.log((bound - speed) / (bound - target)), 0.0
     brake = -math.copysign(top, state[1])
-    even = motor.after(state, brake, motor.until_even(state, brake))[0]
+    even = motor.after(state, brake, motor.time_to_zero_acceleration(state, brake))[0]
     bound = math.copysign(top, target - even)
 
     def ending(first: float) -> tuple[float, float]:
-        """Return where the first stretch, and braking after it, lead, and how long that takes."""
+        """Return the final speed and braking time after a first phase."""
         switch = motor.after(state, bound, first)
-        if switch[1] * bound <= 0.0:  # it still slows down from the other direction
+        if switch[1] * bound <= 0.0:  # still decelerating from the other direction
             return switch[0], 0.0
-        second = motor.until_even(switch, -bound)
+        second = motor.time_to_zero_acceleration(switch, -bound)
         return motor.after(switch, -bound, second)[0], second
 
     short, long = 0.0, 0.25 * motor.tau
@@ -159,10 +160,10 @@ def _quickest(motor: _Motor, state: _State, target: float, top: float) -> tuple[
 
 
 _Legs = tuple[tuple[float, float], ...]
-"""For each stretch u [rad/s] and its length [s]."""
+"""u [rad/s] and length [s] of each phase."""
 
 
-def _whole(
+def _fit_whole_samples(
     motor: _Motor,
     state: _State,
     target: float,
@@ -171,8 +172,8 @@ def _whole(
     lag: float,
     sample_time: float,
 ) -> _Legs | None:
-    """Return two stretches of so many samples in all that end exactly at the target, or None."""
-    most = max(top, abs(state[0])) * _EASY
+    """Return two phases, ``samples`` long in total, that end exactly at the target; else None."""
+    most = max(top, abs(state[0])) * _ROUNDING_MARGIN
     if not motor.tp:
         left = math.exp(-samples * sample_time / motor.tau)
         u = (target - state[0] * left) / (1.0 - left)

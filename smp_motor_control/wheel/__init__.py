@@ -1,1 +1,2 @@
-"""One wheel: its speed loop and what keeps it safe, without ROS."""
+# SPDX-License-Identifier: Apache-2.0
+"""Speed loop, protection and fault handling of one wheel, without ROS."""

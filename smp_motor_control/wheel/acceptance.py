@@ -1,10 +1,9 @@
-"""Which settings a wheel may be given: those whose loop runs, and is stable on the motor's model.
+# SPDX-License-Identifier: Apache-2.0
+"""Acceptance test of a wheel's settings by simulation on the motor's model.
 
-The loop is built from the settings and run for some hundred samples on the linear model of the
-motor, as the hardware shows it: the voltage acts one sample late, and the speed is the mean over
-a sample.  First without clamps, where an unstable loop grows; then as it would drive.  Whatever
-the motor, its clamps let the output be zero, and the reference stands ``stop_time`` after a
-set-point of zero.
+The loop runs for some hundred samples on the linear model, with one sample of delay and the speed
+averaged over a sample: first without clamps, to detect instability; then with them.
+For any motor the clamps must include zero, and the reference must reach zero within ``stop_time``.
 """
 
 import math
@@ -19,116 +18,118 @@ from smp_motor_control.motor.parameters import Gearbox
 from smp_motor_control.motor.response import zero_order_hold
 from smp_motor_control.pid import PidGains
 from smp_motor_control.reference.profile import UNLIMITED, Profile
-from smp_motor_control.wheel.loop import LEARNING, LoopSettings, WheelLoop
+from smp_motor_control.wheel.loop import INTERVAL_SAMPLES, LoopSettings, WheelLoop
 
-RATES = (0.001, 0.002, 0.005, 0.01)
-"""Sampling intervals of which one must do, where the hardware's is not known yet [s]."""
+CANDIDATE_INTERVALS_S = (0.001, 0.002, 0.005, 0.01)
+"""Candidate sampling intervals; one must pass while the actual one is unknown."""
 
-SAMPLES, MOST_SAMPLES = 250, 1500
-"""Length of a trial: four time constants and delays of the motor, but between these."""
+MIN_SAMPLES, MAX_SAMPLES = 250, 1500
+"""Bounds of a simulation's length, nominally four time constants plus delays."""
 
-LARGEST_GAIN = 1e5
-"""Of p, d and feed-forward [V s/rad, V s^2/rad]: a supply's 12 V for an error of 1e-4 rad/s, a
-thousandth of what any encoder resolves; of i, the same per millisecond."""
+MAX_GAIN = 1e5
+"""Maximum of p, d and feed-forward [V s/rad, V s^2/rad]: 12 V for an error of 1e-4 rad/s, a
+thousandth of any encoder's resolution; of i, the same per millisecond."""
 
-GROSS = 2.0
-"""Speed in set-points that no stable loop reaches: an undamped one of second order swings to 2."""
+MAX_SPEED_RATIO = 2.0
+"""Maximum speed relative to the set-point: the peak of an undamped second-order loop."""
 
-USUAL_SUPPLY = 12.0
-"""What drives a wheel whose supply and clamps are not known [V]."""
+TYPICAL_SUPPLY_V = 12.0
+"""Voltage assumed for a wheel with unknown supply and clamps."""
 
-_UNKNOWN = Encoder(2.0**20)
-"""An encoder that is not known yet speaks against no gains: they may be for a fine one."""
+_FINE_ENCODER = Encoder(2.0**20)
+"""Assumed for an unknown encoder, so that quantisation rejects no gains."""
 
-_GROWING = 1.02
-_LONGER = 6  # times a trial whose error still grows: a slow integral's overshoot is over by then
-_FAR = 1e3
-_NOMINAL = MotorModel(dc_gain=25.0, time_constant=0.05)
+_GROWTH_LIMIT = 1.02
+_EXTENSION = 6  # extension of a simulation whose error still grows, for a slow integral's overshoot
+_DIVERGENCE_RATIO = 1e3
+_NOMINAL_MODEL = MotorModel(dc_gain=25.0, time_constant=0.05)
 _NOMINAL_RATIO = 65.5
-_LARGEST = {
-    "p": LARGEST_GAIN,
-    "i": 1e3 * LARGEST_GAIN,
-    "d": LARGEST_GAIN,
-    "feedforward_static": LARGEST_GAIN,
-    "feedforward_velocity": LARGEST_GAIN,
-    "feedforward_acceleration": LARGEST_GAIN,
+_MAX_GAINS = {
+    "p": MAX_GAIN,
+    "i": 1e3 * MAX_GAIN,
+    "d": MAX_GAIN,
+    "feedforward_static": MAX_GAIN,
+    "feedforward_velocity": MAX_GAIN,
+    "feedforward_acceleration": MAX_GAIN,
     "setpoint_weight_p": 1.0,
     "setpoint_weight_d": 1.0,
 }
 
 
 @dataclass(frozen=True)
-class Circumstances:
-    """What is known of the wheel that the settings are for."""
+class OperatingConditions:
+    """Known hardware and sampling interval of a wheel."""
 
-    sample_time: float = math.nan  # usual interval of feedback [s]; NaN before it is known
-    supply: float = math.inf  # [V]; infinite where unknown
-    gearbox: Gearbox | None = None  # none where unknown
-    encoder: Encoder | None = None  # none where unknown
+    sample_time: float = math.nan  # usual interval of feedback [s]; NaN if unknown
+    supply: float = math.inf  # [V]; infinite if unknown
+    gearbox: Gearbox | None = None
+    encoder: Encoder | None = None
 
 
-def check(settings: LoopSettings, wheel: Circumstances | None = None) -> None:
-    """Refuse settings that no wheel should be driven with."""
-    wheel = wheel or Circumstances()
+def check(settings: LoopSettings, wheel: OperatingConditions | None = None) -> None:
+    """Raise for settings that are unsafe to drive a wheel with."""
+    wheel = wheel or OperatingConditions()
     _check_signs(settings.gains)
-    settings = settings.within(wheel.supply)
+    settings = settings.clamp_to_supply(wheel.supply)
     known = _model_at_wheel(settings, wheel)
-    model, ratio = known or (_NOMINAL, _NOMINAL_RATIO)
+    model, ratio = known or (_NOMINAL_MODEL, _NOMINAL_RATIO)
     given = wheel.sample_time
-    intervals = RATES if math.isnan(given) else (min(max(given, 1e-4), 1.0),)
+    intervals = CANDIDATE_INTERVALS_S if math.isnan(given) else (min(max(given, 1e-4), 1.0),)
     _check_stop(settings, model.dc_gain / ratio, intervals[0])
     try:
         with np.errstate(all="ignore"):
             plants = [_Plant(model, ratio, dt) for dt in intervals]
             if known and not any(_is_stable(settings, plant) for plant in plants):
-                raise ParameterError(_unstable(settings, plants[0]))
-            swing = min(_swing(settings, plant, wheel) for plant in plants)
+                raise ParameterError(_explain_instability(settings, plants[0]))
+            swing = min(_find_peak_ratio(settings, plant, wheel) for plant in plants)
     except ParameterError:
         raise
     except (ArithmeticError, ValueError) as error:  # LinAlgError is a ValueError
         raise ParameterError(
             f"the loop cannot be computed with these parameters: {error}; "
-            "look at those of model, observer and drive"
+            "check those of model, observer and drive"
         ) from error
-    if not math.isfinite(swing) or (known and swing > GROSS):
+    if not math.isfinite(swing) or (known and swing > MAX_SPEED_RATIO):
         raise ParameterError(
-            f"the wheel would reach {swing:.3g} times its set-point on the motor's model; at most "
-            f"{GROSS:g} times is accepted: lower i, or set antiwindup_strategy"
+            f"the simulated speed reaches {swing:.3g} times the set-point, and at most "
+            f"{MAX_SPEED_RATIO:g} times is accepted; lower i or set antiwindup_strategy"
         )
 
 
 def _check_signs(gains: PidGains) -> None:
-    for name, largest in _LARGEST.items():
+    for name, largest in _MAX_GAINS.items():
         value = getattr(gains, name)
         least = -largest if name == "d" else 0.0
         if not least <= value <= largest:
-            beyond = max(value - largest, least - value)
+            excess = max(value - largest, least - value)
             raise ParameterError(
                 f"{name} is {value:g}; it must be in [{least:g}, {largest:g}], "
-                f"and is beyond by {beyond:g}"
+                f"and is beyond by {excess:g}"
             )
 
 
 def _check_stop(settings: LoopSettings, speed_per_volt: float, dt: float) -> None:
-    """Refuse clamps that leave no zero, and a reference that stands later than ``stop_time``."""
+    """Raise for clamps that exclude zero and for a reference that exceeds ``stop_time``."""
     gains, limits, drive = settings.gains, settings.limits, settings.drive
     low, high = gains.u_clamp_min, gains.u_clamp_max
     if not low <= 0.0 <= high:
         raise ParameterError(
-            f"u_clamp_min is {low:g} V and u_clamp_max {high:g} V, so that the wheel is driven at "
-            "a set-point of zero; the first must not be above zero, the second not below"
+            f"u_clamp_min is {low:g} V and u_clamp_max {high:g} V, which drives the wheel at a "
+            "set-point of zero; the first must not be above zero, the second not below"
         )
     speed = min(limits.velocity, max(high, -low) * speed_per_volt)
     if drive is not None:
         speed = min(speed, drive.top_speed)
     elif not math.isfinite(speed):
-        speed = min(limits.velocity, USUAL_SUPPLY * speed_per_volt)
+        speed = min(limits.velocity, TYPICAL_SUPPLY_V * speed_per_volt)
     try:
         profile = Profile(limits, settings.transition_time, drive)
         profile.reset(speed)
         profile.set_target(0.0, dt)
     except ArithmeticError as error:
-        raise ParameterError(f"no reference can be computed with these limits: {error}") from error
+        raise ParameterError(
+            f"the reference cannot be computed with these limits: {error}"
+        ) from error
     lag = settings.reference_delay + settings.reference_doubt
     taken, allowed = profile.duration + lag, settings.stop_time
     if taken > allowed + 0.5 * dt:
@@ -142,16 +143,15 @@ def _check_stop(settings: LoopSettings, speed_per_volt: float, dt: float) -> Non
         }
         given = ", ".join(f"{name} {value:g}" for name, value in times.items() if value)
         raise ParameterError(
-            f"{given}: a wheel at {speed:.3g} rad/s stands {taken:.3g} s after a set-point of "
-            f"zero, and stop_time is {allowed:g} s; let it stop faster, or give stop_time what "
-            "you can wait for"
+            f"{given}: a wheel at {speed:.3g} rad/s stops {taken:.3g} s after a set-point of "
+            f"zero, and stop_time is {allowed:g} s; make it stop faster or raise stop_time"
         )
 
 
 def _model_at_wheel(
-    settings: LoopSettings, wheel: Circumstances
+    settings: LoopSettings, wheel: OperatingConditions
 ) -> tuple[MotorModel, float] | None:
-    """Return the motor's model and the gear ratio; None where they are not known."""
+    """Return the motor's model and the gear ratio; None if unknown."""
     gains, model = settings.gains, settings.model
     velocity, acceleration = gains.feedforward_velocity, gains.feedforward_acceleration
     if model is not None:
@@ -165,27 +165,27 @@ def _model_at_wheel(
 
 
 class _Plant:
-    """A motor by its model: exact for a voltage that is held, which acts one sample late."""
+    """Exact discrete motor model with one sample of delay."""
 
     def __init__(self, model: MotorModel, ratio: float, dt: float) -> None:
         self.dt, self.ratio, self.static = dt, ratio, model.static_voltage
         self.final = model.dc_gain / ratio
         tau, tp = model.time_constant, model.time_constant_product
-        # A motor of first order gets an electrical time constant a thousandth of its own.
+        # A first-order motor gets an electrical time constant of a thousandth of its own.
         tp = max(tp, 1e-3 * tau * tau)
         held = zero_order_hold(self.final, tau, tp, dt)
         turned = np.concatenate((held.angle_transition[0], held.angle_forced))
         moved = np.column_stack((held.transition[0], held.forced[0]))
         self._advance: list[list[float]] = np.vstack((turned, moved)).tolist()
-        self.samples = round(min(max(4.0 * (tau + model.delay) / dt, SAMPLES), MOST_SAMPLES))
-        self._late = 1 + math.ceil(min(model.delay / dt, MOST_SAMPLES) - 1e-9)
+        self.samples = round(min(max(4.0 * (tau + model.delay) / dt, MIN_SAMPLES), MAX_SAMPLES))
+        self._late = 1 + math.ceil(min(model.delay / dt, MAX_SAMPLES) - 1e-9)
 
     def rest(self) -> None:
         self.angle = self.speed = self.rate = 0.0
         self._held = [0.0] * self._late
 
     def step(self, voltage: float, static: float) -> float:
-        """Take a command; return the mean speed until the next sample."""
+        """Apply a voltage; return the mean speed until the next sample."""
         self._held.append(voltage)
         drive = self._held.pop(0)
         if static:
@@ -199,22 +199,16 @@ class _Plant:
 
 
 def _is_stable(settings: LoopSettings, plant: _Plant) -> bool:
-    """Tell whether the loop without clamps comes to rest after a step of its set-point.
-
-    A measured speed may be late by a filter's lag, for which its gains are made.
-    """
+    """Return whether the loop without clamps settles after a step, possibly on a filtered speed."""
     filtered = settings.speed_source == "measured"
     lag = settings.reference_delay - plant.dt if filtered else 0.0
-    return _settles(settings, plant, 1.0) or (
-        lag > plant.dt and _settles(settings, plant, 1 - math.exp(-plant.dt / lag))
+    return _error_decays(settings, plant, 1.0) or (
+        lag > plant.dt and _error_decays(settings, plant, 1 - math.exp(-plant.dt / lag))
     )
 
 
-def _settles(settings: LoopSettings, plant: _Plant, share: float) -> bool:
-    """Tell whether the error ceases to grow, a share of the speed's change shown in a sample.
-
-    A slow integral overshoots for longer than the motor's own response takes.
-    """
+def _error_decays(settings: LoopSettings, plant: _Plant, share: float) -> bool:
+    """Return whether the error stops growing; ``share`` is the weight of the speed's filter."""
     open_clamps = replace(
         settings.gains, u_clamp_min=-math.inf, u_clamp_max=math.inf, i_clamp_min=-math.inf,
         i_clamp_max=math.inf, antiwindup_strategy="none", error_deadband=0.0,
@@ -225,21 +219,21 @@ def _settles(settings: LoopSettings, plant: _Plant, share: float) -> bool:
     plant.rest()
     speed = shown = 0.0
     errors: list[float] = []
-    for length in (plant.samples, _LONGER * plant.samples):
+    for length in (plant.samples, _EXTENSION * plant.samples):
         while len(errors) < length:
             speed = plant.step(loop.step(1.0, shown, plant.dt).output, 0.0)
             shown += share * (speed - shown)
-            if not -_FAR < speed < _FAR:
+            if not -_DIVERGENCE_RATIO < speed < _DIVERGENCE_RATIO:
                 return False
             errors.append(abs(1.0 - speed))
         quarter = length // 4
         early, late = max(errors[quarter : 2 * quarter]), max(errors[-quarter:])
-        if late < max(_GROWING * early, 0.02):
+        if late < max(_GROWTH_LIMIT * early, 0.02):
             return True
     return False
 
 
-def _unstable(settings: LoopSettings, plant: _Plant) -> str:
+def _explain_instability(settings: LoopSettings, plant: _Plant) -> str:
     gains = settings.gains
     low, high = 0.0, 1.0
     for _ in range(5):
@@ -256,30 +250,30 @@ def _unstable(settings: LoopSettings, plant: _Plant) -> str:
     )
 
 
-def _swing(settings: LoopSettings, plant: _Plant, wheel: Circumstances) -> float:
-    """Return the largest speed, in set-points, of the loop as it would drive the wheel.
+def _find_peak_ratio(settings: LoopSettings, plant: _Plant, wheel: OperatingConditions) -> float:
+    """Return the peak speed relative to the set-point, with clamps.
 
-    It stands until an observer knows its interval, as it does before the first set-point.
+    The wheel stands until an observer has learnt its interval.
     """
-    encoder = wheel.encoder or _UNKNOWN
+    encoder = wheel.encoder or _FINE_ENCODER
     loop = WheelLoop(settings, Gearbox(plant.ratio), encoder, 1.5 * wheel.supply)
     plant.rest()
     dt = plant.dt
-    most = min(settings.gains.u_clamp_max, -settings.gains.u_clamp_min, USUAL_SUPPLY)
+    most = min(settings.gains.u_clamp_max, -settings.gains.u_clamp_min, TYPICAL_SUPPLY_V)
     target = max(0.2 * plant.final * max(most - plant.static, 0.0), 1e-9)
     target = min(target, settings.limits.velocity or math.inf)
     speed = voltage = fastest = 0.0
-    for k in range(LEARNING + plant.samples):
+    for k in range(INTERVAL_SAMPLES + plant.samples):
         count = math.floor(plant.angle * plant.ratio / encoder.angle_per_count)
         measured = loop.speed(dt, speed, count, voltage)
         out = 0.0
         if measured == measured:
-            out = loop.step(target if k >= LEARNING else 0.0, measured, dt).output
+            out = loop.step(target if k >= INTERVAL_SAMPLES else 0.0, measured, dt).output
             if out - out != 0.0:
                 return math.nan
         speed = plant.step(out, plant.static)
         voltage = out
         fastest = max(fastest, abs(plant.speed))
-        if not fastest < _FAR * target:
+        if not fastest < _DIVERGENCE_RATIO * target:
             break
     return fastest / target

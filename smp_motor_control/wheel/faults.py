@@ -1,6 +1,7 @@
-"""Which motor misbehaves, and how often and how gently it may be tried again.
+# SPDX-License-Identifier: Apache-2.0
+"""Detection of motor faults, and the retries after them.
 
-Pure logic on numbers; times are seconds on a steady clock.
+Times are in seconds on a steady clock.
 """
 
 import math
@@ -10,72 +11,71 @@ from enum import Enum
 from smp_motor_control.errors import check_positive
 from smp_motor_control.fields import described
 
-MOST_TRIES = 3
-"""How often a wheel at fault is tried again before only a person may reset it."""
+MAX_TRIES = 3
+"""Retries of a wheel at fault before an operator must reset it."""
 
-PROVEN_AFTER = 2.0
-"""Time of turning as driven after which a fault is over, and its tries are forgotten [s]."""
+PROVEN_AFTER_S = 2.0
+"""Time of normal turning that ends a fault and clears its retries."""
 
-TRUSTED_AFTER = 0.6
-"""Time of turning as driven after which a try may use the full voltage [s]: what does not follow
-is found before."""
+TRUSTED_AFTER_S = 0.6
+"""Time of normal turning after which a retry may use the full voltage; faults show earlier."""
 
-_ZERO_RELEASES = 0.5
-"""Time for which a set-point of zero must stand before it releases a wheel [s]."""
+_RELEASE_TIME_S = 0.5
+"""Time of a zero set-point that releases a wheel."""
 
-_CAUTION = 1.05
-"""Largest voltage of a try, in the voltage at which the wheel must turn."""
+_TRIAL_VOLTAGE_RATIO = 1.05
+"""Maximum voltage of a retry, relative to ``stall_voltage``."""
 
-_SLOWEST = 0.3
-"""Error that is never a fault [rad/s]: one count at 1 kHz is 0.19 at the wheel of the paper."""
+_MIN_ERROR = 0.3
+"""Errors up to this are never a fault [rad/s]; one count at 1 kHz is 0.19 at the paper's wheel."""
 
-_IMPROVING = 0.95
-"""Of its way to the reference a wheel that accelerates has less than this left a window later."""
+_MAX_REMAINING_SHARE = 0.95
+"""Maximum fraction of the error that an accelerating wheel has left a window later."""
 
-_SATURATED = 0.7
-"""Tolerated share of a set-point that the voltage may not suffice for, where that is unknown."""
+_SATURATED_TOLERANCE = 0.7
+"""Tolerated relative error at saturation when the reachable speed is unknown."""
 
-STRAIN, STRAIN_LASTS = 1.5, 1.5
-"""Times the voltage that its speed takes a wheel gets that is strained, and for how long [s]."""
+OVERLOAD_RATIO, OVERLOAD_TIME_S = 1.5, 1.5
+"""Ratio of actual to needed voltage that counts as overload, and its minimum duration."""
 
-_GOOD = 0.1
-"""Share of the speed within which a wheel follows well enough to learn its volts per speed."""
+_GOOD_TRACKING_SHARE = 0.1
+"""Maximum relative error at which volts per speed are learnt."""
 
 
 class Fault(Enum):
-    """What can be wrong with a wheel that is being driven."""
+    """Faults of a driven wheel."""
 
-    STALL = "no counts under voltage: stall (or dead encoder)"
-    DEAD_ENCODER = "no counts under voltage: dead encoder (or stall)"
-    NO_MOTION = "no counts under voltage: stall or dead encoder"
-    RUNAWAY = "runaway: the wheel turns against its voltage (wrong sign of motor or encoder?)"
-    WRONG_WAY = "runaway: the wheel turns against its set-point (wrong sign of motor or encoder?)"
+    STALL = "no counts under voltage: stalled wheel or, less likely, dead encoder"
+    DEAD_ENCODER = "no counts under voltage: dead encoder or, less likely, stalled wheel"
+    NO_MOTION = "no counts under voltage: stalled wheel or dead encoder"
+    RUNAWAY = "runaway: the wheel turns against its voltage; check the signs of motor and encoder"
+    WRONG_WAY = (
+        "runaway: the wheel turns against its set-point; check the signs of motor and encoder"
+    )
     NOT_FOLLOWING = "the wheel does not follow its set-point"
     OVER_CURRENT = "over-current"
-    COMPUTATION = "the controller cannot compute with these parameters"
+    COMPUTATION = "the controller's computation fails with these parameters"
 
 
 @dataclass(frozen=True, kw_only=True)
 class FaultLimits:
-    """When a motor misbehaves."""
+    """Thresholds of the fault detector."""
 
     current_limit: float = described(
-        0.0, "Current above which the motor is switched off [A]; 0 for none."
+        0.0, "Current above which the motor is switched off [A]; 0: no limit."
     )
-    current_time: float = described(0.1, "Time above the limit before that [s].")
-    stall_voltage: float = described(4.0, "Least voltage at which the wheel must turn [V].")
-    stall_velocity: float = described(0.02, "Least speed that counts as turning [rad/s, wheel].")
-    stall_time: float = described(
-        0.5, "Time without turning before the motor is switched off [s]; 0: never."
-    )
+    current_time: float = described(0.1, "Time above the current limit before switch-off [s].")
+    stall_voltage: float = described(4.0, "Voltage from which the wheel must turn [V].")
+    stall_velocity: float = described(0.02, "Speed that counts as turning [rad/s, wheel].")
+    stall_time: float = described(0.5, "Time without turning before switch-off [s]; 0: never.")
     runaway_time: float = described(
-        0.2, "Time of turning against the voltage before that [s]; 0: never."
+        0.2, "Time of turning against the voltage before switch-off [s]; 0: never."
     )
     tracking_tolerance: float = described(
         0.5, "Tolerated lasting error of the speed, as a share of the reference."
     )
     tracking_time: float = described(
-        0.45, "Time of being off by more before the motor is switched off [s]; 0: never."
+        0.45, "Time of a larger tracking error before switch-off [s]; 0: never."
     )
 
     def __post_init__(self) -> None:
@@ -84,29 +84,29 @@ class FaultLimits:
 
 
 class FaultDetector:
-    """Watches voltage, speed and current of a driven motor."""
+    """Detect faults from voltage, speed and current of a driven motor."""
 
     def __init__(self, limits: FaultLimits, resistance: float = math.nan) -> None:
         self.limits = limits
         self.resistance = resistance
-        # Of the wheel [V s/rad], [V], where a model says; NaN and 0 where it is to be learnt.
+        # Of the wheel's model [V s/rad], [V]; NaN and 0 without a model
         self.volts_per_speed, self.static_voltage = math.nan, 0.0
-        self._learnt = math.nan
-        self._least = math.inf  # least volts per speed of a wheel that followed
+        self._learnt = math.nan  # volts per speed [V s/rad]
+        self._least = math.inf  # its minimum so far
         self.reset()
 
     def reset(self) -> None:
-        """Forget what led here."""
+        """Discard all evidence."""
         self._still = self._wrong = self._hot = 0.0
         self._wrong_speed = 0.0
-        self._strained = 0.0
-        self.strain: tuple[float, float] | None = None  # voltage in force, and that would do [V]
+        self._overloaded = 0.0
+        self.overload: tuple[float, float] | None = None  # actual and needed voltage [V]
         self._begin_window(math.nan)
 
     def step(
         self, dt: float, voltage: float, velocity: float, current: float, *, stands: bool = False
     ) -> Fault | None:
-        """Take in one sample, of a wheel whose reference is zero where it ``stands``."""
+        """Return the fault shown by one more sample; ``stands``: the reference is zero."""
         limits = self.limits
         if limits.current_limit > 0.0 and abs(current) > limits.current_limit:
             self._hot += dt
@@ -121,12 +121,12 @@ class FaultDetector:
                 return self._no_motion(voltage, current)
         else:
             self._still = 0.0
-        # A slope makes a wheel creep until the voltage holds it.
-        slowest = max(self.limits.stall_velocity, _SLOWEST if stands else 0.0)
+        # On a slope a wheel creeps until the voltage holds it.
+        slowest = max(self.limits.stall_velocity, _MIN_ERROR if stands else 0.0)
         return self._runaway(dt, voltage, velocity, slowest)
 
     def _runaway(self, dt: float, voltage: float, velocity: float, slowest: float) -> Fault | None:
-        """Return a fault where a wheel turns against its voltage and, unlike a braked one, on."""
+        """Return a fault when a wheel turns against its voltage without slowing down."""
         limits = self.limits
         against = voltage * velocity < 0.0 and abs(velocity) >= slowest
         if not against or abs(voltage) < 0.5 * limits.stall_voltage:
@@ -141,8 +141,8 @@ class FaultDetector:
     def _no_motion(self, voltage: float, current: float) -> Fault:
         if math.isnan(current) or math.isnan(self.resistance):
             return Fault.NO_MOTION
-        # At standstill all voltage drives current, R i = v.  A turning motor takes less, but one
-        # whose friction eats all of its torque not much less: the name tells the other cause too.
+        # At standstill R i = v.  A turning motor with high friction has a similar current, so the
+        # message names both causes.
         if abs(current) * self.resistance > 0.85 * abs(voltage):
             return Fault.STALL
         return Fault.DEAD_ENCODER
@@ -154,11 +154,10 @@ class FaultDetector:
     def follow(
         self, dt: float, reference: float, velocity: float, voltage: float, saturated: bool
     ) -> Fault | None:
-        """Compare speed and reference, each by its mean over a third of the tracking time.
+        """Return a fault when the mean speed does not follow the mean reference.
 
-        Two windows in succession must be off, and the speed of the second no nearer to its
-        reference than that of the first, so that neither noise nor a wheel that still accelerates
-        is taken for a fault.
+        Two successive windows of a third of the tracking time must be off without improvement, so
+        that neither noise nor acceleration counts as a fault.
         """
         self._reference += reference * dt
         self._speed += velocity * dt
@@ -171,46 +170,49 @@ class FaultDetector:
         share = self.limits.tracking_tolerance
         if self._saturated:
             reachable = self._reachable(abs(self._voltage) / elapsed)
-            share = max(share, _SATURATED) if reachable == math.inf else share
+            share = max(share, _SATURATED_TOLERANCE) if reachable == math.inf else share
             asked = max(min(asked, reachable), -reachable)
-        elif abs(asked - speed) < _GOOD * abs(speed) > _GOOD * _SLOWEST:
+        elif (
+            abs(asked - speed)
+            < _GOOD_TRACKING_SHARE * abs(speed)
+            > _GOOD_TRACKING_SHARE * _MIN_ERROR
+        ):
             self._learnt = abs(self._voltage / self._speed)
             self._least = min(self._least, self._learnt)
-        self._judge_strain(abs(self._voltage) / elapsed, abs(speed), elapsed)
+        self._judge_overload(abs(self._voltage) / elapsed, abs(speed), elapsed)
         error = abs(asked - speed)
-        off = error > share * abs(asked) + _SLOWEST and self.limits.tracking_time > 0.0
+        off = error > share * abs(asked) + _MIN_ERROR and self.limits.tracking_time > 0.0
         self._begin_window(speed if off else math.nan)
         stalled = self._still > 0.0 and self.limits.stall_time > 0.0
-        way = abs(asked - before)  # NaN: the window before was good
-        if stalled or not (off and error > _IMPROVING * way):
+        way = abs(asked - before)  # NaN: the previous window was good
+        if stalled or not (off and error > _MAX_REMAINING_SHARE * way):
             return None
         return Fault.WRONG_WAY if asked * speed < 0.0 else Fault.NOT_FOLLOWING
 
-    def _judge_strain(self, voltage: float, speed: float, elapsed: float) -> None:
-        """Compare a window's voltage with what its speed takes, by a model or as it once did."""
+    def _judge_overload(self, voltage: float, speed: float, elapsed: float) -> None:
+        """Compare a window's voltage with that needed by its speed, modelled or learnt."""
         per_speed = self.volts_per_speed if self.volts_per_speed > 0.0 else self._least
         needed = per_speed * speed + self.static_voltage if per_speed < math.inf else math.inf
-        high = voltage > STRAIN * needed + 0.75 * self.limits.stall_voltage
-        self._strained = self._strained + elapsed if high else 0.0
-        self.strain = (voltage, needed) if self._strained >= STRAIN_LASTS else None
+        high = voltage > OVERLOAD_RATIO * needed + 0.75 * self.limits.stall_voltage
+        self._overloaded = self._overloaded + elapsed if high else 0.0
+        self.overload = (voltage, needed) if self._overloaded >= OVERLOAD_TIME_S else None
 
     def _reachable(self, voltage: float) -> float:
-        """Return the speed for which a voltage suffices; infinite where that is not known."""
+        """Return the steady speed at a voltage; infinite if unknown."""
         if self.volts_per_speed > 0.0:
             return max(voltage - self.static_voltage, 0.0) / self.volts_per_speed
         return voltage / self._learnt if self._learnt > 0.0 else math.inf
 
 
-_SILENT = (Fault.STALL, Fault.DEAD_ENCODER, Fault.NO_MOTION)
+_NO_COUNT_FAULTS = (Fault.STALL, Fault.DEAD_ENCODER, Fault.NO_MOTION)
 
 
 class Recovery:
-    """Holds a wheel at fault, lets it be tried a few times, and then waits for a person.
+    """Hold a wheel at fault, retry it a few times, then latch it until a reset.
 
-    A try begins when the set-point has been zero for half a second, when a wheel that gave
-    no counts is seen to turn, or after a pause that doubles every time.  It is limited to a
-    small voltage until the wheel has turned as driven for :data:`TRUSTED_AFTER`, and drives
-    nothing at a set-point of zero.  After :data:`MOST_TRIES` the wheel is latched.
+    A retry starts when the set-point has been zero for half a second, when a wheel without counts
+    turns, or after a pause that doubles each time.  Its voltage is limited until the wheel has
+    turned normally for :data:`TRUSTED_AFTER_S`.  After :data:`MAX_TRIES` the wheel is latched.
     """
 
     def __init__(self, first_pause: float = 2.0) -> None:
@@ -218,47 +220,49 @@ class Recovery:
         self.reset()
 
     def reset(self) -> None:
-        """Begin anew, as after a person has looked at the wheel."""
-        self.fault: Fault | None = None  # what holds the wheel
-        self.cautious = False  # whether the voltage is limited, as the fault may still be there
-        self.failures = 0  # since the wheel was last proven sound
+        """Clear all faults."""
+        self.fault: Fault | None = None
+        self.cautious = False  # whether a fault may still exist, so that the voltage is limited
+        self.failures = 0  # since the wheel last turned normally
         self._since = self._good = 0.0
 
     @property
     def latched(self) -> bool:
-        """Whether only :meth:`reset` lets the wheel go."""
-        return self.fault is not None and self.failures > MOST_TRIES
+        """Whether only :meth:`reset` releases the wheel."""
+        return self.fault is not None and self.failures > MAX_TRIES
 
     def set(self, fault: Fault, now: float) -> None:
-        """Hold the wheel."""
+        """Hold the wheel because of a fault."""
         self.fault, self._since = fault, now
         self.cautious = True
         self.failures += 1
         self._good = 0.0
 
     def may_release(self, setpoint: float, now: float, turns: bool = False) -> bool:
-        """Tell whether the wheel may be tried again, and let go of it if so."""
-        if self.failures > MOST_TRIES:
+        """Return whether a retry may start, and start it."""
+        if self.failures > MAX_TRIES:
             return False
         waited = now - self._since
         pause = self.first_pause * 2.0 ** (self.failures - 1)
-        alive = turns and self.fault in _SILENT
-        rested = setpoint == 0.0 and waited > _ZERO_RELEASES
+        alive = turns and self.fault in _NO_COUNT_FAULTS
+        rested = setpoint == 0.0 and waited > _RELEASE_TIME_S
         if alive or rested or (pause > 0.0 and waited > pause):
             self.fault = None
             return True
         return False
 
-    def limited(self, voltage: float, velocity: float, dt: float, limits: FaultLimits) -> float:
-        """Return the voltage of a try, and learn from how the wheel turns."""
+    def limit_voltage(
+        self, voltage: float, velocity: float, dt: float, limits: FaultLimits
+    ) -> float:
+        """Return the limited voltage of a retry, and assess the wheel's motion."""
         if voltage * velocity > 0.0 and abs(velocity) > limits.stall_velocity:
             self._good += dt
-        elif self._good < TRUSTED_AFTER:
+        elif self._good < TRUSTED_AFTER_S:
             self._good = 0.0
-        trusted = self._good >= TRUSTED_AFTER
-        if self._good >= PROVEN_AFTER:
+        trusted = self._good >= TRUSTED_AFTER_S
+        if self._good >= PROVEN_AFTER_S:
             self.reset()
         if trusted:
             return voltage
-        most = _CAUTION * limits.stall_voltage
+        most = _TRIAL_VOLTAGE_RATIO * limits.stall_voltage
         return min(max(voltage, -most), most)

@@ -1,35 +1,34 @@
-"""Is this feedback new, and how long is it since the sample before.
+# SPDX-License-Identifier: Apache-2.0
+"""Freshness and sampling interval of feedback.
 
-Pure logic on numbers; times are seconds on a steady clock unless they are stamps.
+Times other than stamps are in seconds on a steady clock.
 """
 
 import math
 from enum import Enum
 
-CLOCK_JUMP = 1.0
-"""Stamps that are off by more than this [s] tell of a clock that jumped, not of a delay: unless
-they go on from the sample before, which those of a clock that was set back do not."""
+CLOCK_JUMP_S = 1.0
+"""An age beyond this is a clock jump rather than a delay, unless the stamps are continuous."""
 
-_CLOCKS_AGREE = 0.1
-"""Between readings of one instant on two clocks of a computer no more than this passes [s]."""
+_MAX_CLOCK_SKEW_S = 0.1
+"""Maximum time between readings of two clocks at one instant."""
 
 
 class Verdict(Enum):
-    """What a feedback sample is, by its stamp."""
+    """Assessment of a feedback sample by its stamp."""
 
     FRESH = "fresh"
     FIRST = "first after a start, a gap or a clock jump"
     DUPLICATE = "duplicate"
-    REORDERED = "older than the one before"
+    REORDERED = "out of order"
     LATE = "late"
 
 
 class FeedbackClock:
-    """Tells the interval between feedback samples, and which of them to leave out.
+    """Measure the interval between feedback samples and reject outdated ones.
 
-    The stamps' clock and the computer's may differ by a constant: an offset beyond
-    :data:`CLOCK_JUMP` is learnt at the start and after every jump, and ages are counted
-    from there.
+    The clock of the stamps may have a constant offset: one beyond :data:`CLOCK_JUMP_S` is learnt at
+    the start and after every jump, and subtracted from ages.
     """
 
     def __init__(self, max_age: float, max_gap: float) -> None:
@@ -38,21 +37,21 @@ class FeedbackClock:
         self.counts = dict.fromkeys(Verdict, 0)
         self.jumps = 0  # of the stamps' clock
         self.unstamped = False  # whether the last sample had no stamp
-        self.offset = 0.0  # learnt difference of the clocks [s]
-        self.dt = 0.0  # interval that ends with the last fresh sample [s]
-        self.gap = 0.0  # interval that was too long, where the last sample came after one [s]
-        self.age = 0.0  # from stamp to arrival of the last sample, less the offset [s]
+        self.offset = 0.0  # learnt clock offset [s]
+        self.dt = 0.0  # interval before the last fresh sample [s]
+        self.gap = 0.0  # interval before the last sample, if it was too long [s]
+        self.age = 0.0  # of the last sample at arrival, without the offset [s]
         self._last: int | None = None
         self._heard = -math.inf
 
     def reset(self) -> None:
-        """Take the next sample as a first one."""
+        """Treat the next sample as the first."""
         self._last = None
 
     def accept(self, stamp: int, now: int, steady: float | None = None) -> Verdict:
-        """Judge a sample by its stamp and its arrival [ns]; a stamp of 0 stands for the arrival.
+        """Assess a sample by its stamp and arrival [ns]; a stamp of 0 means the arrival.
 
-        ``steady`` is the arrival on a clock that nobody sets [s].
+        ``steady`` is the arrival on a steady clock [s].
         """
         self.unstamped = not stamp
         verdict = self._judge(stamp or now, now, now * 1e-9 if steady is None else steady)
@@ -64,13 +63,13 @@ class FeedbackClock:
         age = raw_age - self.offset
         last = self._last
         step = 0.0 if last is None else (stamp - last) * 1e-9
-        # No sample ages by more than the time that has passed: else our own clock was set.
-        aged = age - self.age <= steady - self._heard + _CLOCKS_AGREE
+        # If the age grows by more than the elapsed time, this computer's clock was set.
+        aged = age - self.age <= steady - self._heard + _MAX_CLOCK_SKEW_S
         self._heard = steady
-        delayed = age >= CLOCK_JUMP and 0.0 < step <= self.max_gap and aged
-        if step < -CLOCK_JUMP or not (-CLOCK_JUMP < age < CLOCK_JUMP or delayed):
+        delayed = age >= CLOCK_JUMP_S and 0.0 < step <= self.max_gap and aged
+        if step < -CLOCK_JUMP_S or not (-CLOCK_JUMP_S < age < CLOCK_JUMP_S or delayed):
             self.jumps += last is not None
-            self.offset = raw_age if abs(raw_age) > CLOCK_JUMP else 0.0
+            self.offset = raw_age if abs(raw_age) > CLOCK_JUMP_S else 0.0
             self.age = raw_age - self.offset
             self._last = stamp
             return Verdict.FIRST

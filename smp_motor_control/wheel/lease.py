@@ -1,27 +1,27 @@
-"""Who may drive a wheel: the writer that drove it last, until it has rested for a while."""
+# SPDX-License-Identifier: Apache-2.0
+"""Exclusive ownership of a wheel by the node that commands it."""
 
 import math
 
 from smp_motor_control.wheel.freshness import FeedbackClock, Verdict
 
-LONGEST = 1.0
-"""Of a lease whose wheel's commands never expire [s]."""
+MAX_LEASE_S = 1.0
+"""Maximum duration of a lease."""
 
-MOST_WRITERS = 64
-"""That are known at a time, by their clocks and their refusals; more are no robot's."""
+MAX_WRITERS = 64
+"""Maximum number of writers whose clocks and refusals are stored."""
 
-OTHERS = "others"
-"""Under which refused commands of still more writers are counted."""
+OTHER_WRITERS = "others"
+"""Name under which refused commands of further writers are counted."""
 
 
 class Lease:
-    """Decides whose commands a wheel obeys.
+    """Decide which writer's commands a wheel obeys.
 
-    Every command other than 0 V takes the wheel, where it is free, or renews the lease of its
-    owner.  Zero commands renew nothing, so that a writer which rests, ends or dies gives the
-    wheel back by itself after ``timeout``; until then all others are refused.  A command that is
-    late by ``timeout``, by its stamp, was meant for another moment: it is refused unless it is 0 V.
-    Drivers that stood still find such in their queues.
+    A non-zero command takes a free wheel or renews its owner's lease.  Zero commands renew nothing,
+    so the lease ends ``timeout`` after the last non-zero one; until then other writers are refused.
+    A non-zero command that is older than ``timeout`` by its stamp, as from the queue of a delayed
+    driver, is refused.
 
     Examples
     --------
@@ -34,28 +34,28 @@ class Lease:
 
     def __init__(self, timeout: float) -> None:
         self.set_timeout(timeout)
-        self.refused: dict[str, int] = {}  # how many commands of each writer were refused
-        self.late = 0  # how many commands came late
+        self.refused: dict[str, int] = {}  # number of refused commands by writer
+        self.late = 0  # number of late commands
         self._owner = ""
         self._until = -math.inf
         self._clocks: dict[str, FeedbackClock] = {}
 
     def set_timeout(self, timeout: float) -> None:
         """Set the age at which commands expire [s]."""
-        self.timeout, self._expire = min(timeout, LONGEST), timeout
+        self.timeout, self._expire = min(timeout, MAX_LEASE_S), timeout
         self._clocks = {}
 
     def take(
         self, writer: str, voltage: float, now: float, stamp: int = 0, arrival: int = 0
     ) -> bool:
-        """Judge a command by its writer, its arrival on a steady clock [s], and its stamp [ns].
+        """Return whether a command is obeyed, given its arrival on a steady clock [s].
 
-        ``arrival`` is read from the stamp's clock [ns]; a stamp of 0 tells nothing.
+        ``stamp`` and ``arrival`` are on the stamp's clock [ns]; a stamp of 0 means none.
         """
         late = self._is_late(writer, now, stamp, arrival)
         if writer != self._owner and now < self._until:
-            known = writer in self.refused or len(self.refused) < MOST_WRITERS
-            name = writer if known else OTHERS
+            known = writer in self.refused or len(self.refused) < MAX_WRITERS
+            name = writer if known else OTHER_WRITERS
             self.refused[name] = self.refused.get(name, 0) + 1
             return False
         if late and voltage != 0.0:
@@ -68,11 +68,11 @@ class Lease:
     def _is_late(self, writer: str, now: float, stamp: int, arrival: int) -> bool:
         clocks = self._clocks
         clock = clocks.pop(writer, None) or FeedbackClock(self._expire, math.inf)
-        clocks[writer] = clock  # the last one to be forgotten
-        if len(clocks) > MOST_WRITERS:
+        clocks[writer] = clock  # newest last
+        if len(clocks) > MAX_WRITERS:
             del clocks[next(iter(clocks))]
         return clock.accept(stamp, arrival, now) is Verdict.LATE
 
     def owner(self, now: float) -> str:
-        """Return who owns the wheel; empty where nobody does, or nobody that says its name."""
+        """Return the owner of the wheel; empty without an owner or for one without a name."""
         return self._owner if now < self._until else ""

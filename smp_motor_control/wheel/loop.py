@@ -1,6 +1,7 @@
-"""One wheel's speed loop without ROS: speed source, reference, PID.
+# SPDX-License-Identifier: Apache-2.0
+"""Speed loop of one wheel: speed source, reference and PID.
 
-Set-point and speeds are the wheel's; counts and the model are the motor's.
+Set-point and speeds are at the wheel; counts and the model are at the motor.
 """
 
 import math
@@ -19,35 +20,34 @@ from smp_motor_control.reference.profile import Drive, Profile, ProfileLimits, R
 from smp_motor_control.wheel.differenced import differenced_gains
 from smp_motor_control.wheel.plausibility import PlausibleSpeed
 from smp_motor_control.wheel.standstill import Standstill
-from smp_motor_control.wheel.stop import LONGEST_STOP
+from smp_motor_control.wheel.stop import MAX_STOP_TIME_S
 
 SPEED_SOURCES = ("measured", "difference", "observer")
 
-LONGEST_TRANSITION = 60.0
-"""Largest duration of a change of set-point [s]."""
+MAX_TRANSITION_S = 60.0
+"""Maximum duration of a change of set-point."""
 
-LEARNING = 20
-"""Samples from which the observer learns the usual interval."""
+INTERVAL_SAMPLES = 20
+"""Number of samples from which the observer's interval is learnt."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class LoopSettings:
-    """Everything that shapes the loop."""
+    """Settings of the loop."""
 
-    gains: PidGains = nested(PidGains())  # volts of wheel speeds
+    gains: PidGains = nested(PidGains())
     limits: ProfileLimits = nested(ProfileLimits())  # of the reference, at the wheel
     transition_time: float = described(
-        0.0, "Duration of every change of set-point [s]; 0: as fast as limits allow.",
-        minimum=0.0, maximum=LONGEST_TRANSITION,
+        0.0, "Duration of every change of set-point [s]; 0: as fast as the limits allow.",
+        minimum=0.0, maximum=MAX_TRANSITION_S,
     )  # fmt: skip
     stop_time: float = described(
-        1.0, "Time after a set-point of zero, or after the last one's time-out, at which nothing "
-        "drives the wheel any more [s].", minimum=0.05, maximum=LONGEST_STOP,
+        1.0, "Time after a zero set-point, or after the set-point's time-out, when the wheel is "
+        "no longer driven [s].", minimum=0.05, maximum=MAX_STOP_TIME_S,
     )  # fmt: skip
-    # The error is taken from the reference of that long ago, so that a wheel that does what its
-    # model says is left alone; 0: from the present one.
+    # The measurement is compared with the reference of this long ago; 0: with the present one.
     reference_delay: float = described(
-        0.0, "Lag of the measured speed behind the reference: delay and averaging [s].",
+        0.0, "Lag of the measured speed behind the reference, by delay and averaging [s].",
         minimum=0.0, maximum=10.0,
     )  # fmt: skip
     # There is no error while the measurement is what the reference was within so much of the delay.
@@ -57,11 +57,13 @@ class LoopSettings:
     # Motor and voltage that changes of set-point keep to, in wheel rad/s; see
     # :class:`~smp_motor_control.reference.profile.Profile`
     drive: Drive | None = optional(Drive, "top_speed", prefix="drive.")
-    speed_source: str = described("measured", f"{', '.join(SPEED_SOURCES[:2])} or observer.")
-    difference_window: int = described(
-        4, "Samples to difference counts over.", minimum=1, maximum=1000
+    speed_source: str = described(
+        "measured", f"Speed source: {', '.join(SPEED_SOURCES[:2])} or observer."
     )
-    # Of the motor, for the observer, and for the jerk in the feed-forward
+    difference_window: int = described(
+        4, "Number of samples over which counts are differenced.", minimum=1, maximum=1000
+    )
+    # For the observer and for the jerk in the feed-forward
     model: MotorModel | None = optional(MotorModel, "dc_gain", "time_constant", prefix="model.")
     noise: ObserverNoise = nested(ObserverNoise(), prefix="observer.")
     implausible_jump: float = described(
@@ -79,8 +81,8 @@ class LoopSettings:
                 "speed_source is 'observer', which needs model.dc_gain and model.time_constant"
             )
 
-    def within(self, supply_voltage: float) -> "LoopSettings":
-        """Return the same with the output limited to what a supply can give."""
+    def clamp_to_supply(self, supply_voltage: float) -> "LoopSettings":
+        """Return the same settings with the output limited to the supply."""
         gains = replace(
             self.gains,
             u_clamp_min=max(self.gains.u_clamp_min, -supply_voltage),
@@ -92,8 +94,8 @@ class LoopSettings:
 class WheelLoop:
     """Speed loop of one wheel, one step per feedback sample.
 
-    ``reference`` and ``source`` (of the speed) are those of the last step, ``jumps`` how many
-    readings of the speed were left out.
+    ``reference`` and ``source`` (of the speed) are those of the last step; ``jumps`` is the number
+    of ignored readings.
     """
 
     def __init__(
@@ -109,7 +111,7 @@ class WheelLoop:
         self.reference = Reference(0.0, 0.0, 0.0)
         self._path = ReferencePath(self.profile)
         self.source, self.jumps = "measured", 0
-        self._late = 0.0  # by which counts differenced in the observer's place are later [s]
+        self._extra_lag = 0.0  # of differenced counts while the observer is not trusted [s]
         self._standstill = Standstill()
         self._plausible = PlausibleSpeed()
         self.configure(settings)
@@ -118,29 +120,32 @@ class WheelLoop:
     def set_hardware(
         self, gearbox: Gearbox | None, encoder: Encoder | None, max_load: float = math.inf
     ) -> None:
-        """Tell what is between motor and wheel."""
+        """Set the hardware between motor and wheel."""
         self._gearbox, self._encoder, self._max_load = gearbox, encoder, max_load
-        self._width, self.wraps_at = CounterWidth(), 0  # bits at which it does, against its word
-        self.renew_speed()
+        self._width, self.wraps_at = (
+            CounterWidth(),
+            0,
+        )  # detected width that differs from encoder.bits
+        self.rebuild_speed_source()
 
     def configure(self, settings: LoopSettings) -> None:
-        """Change settings while running, without a jump of the output."""
+        """Change settings without a jump of the output."""
         old, self.settings = self.settings, settings
         shaped = ("speed_source", "difference_window", "model", "noise")
         if any(getattr(old, name) != getattr(settings, name) for name in shaped):
-            self.renew_speed()
+            self.rebuild_speed_source()
         self.pid.set_gains(self._gains())
         self.profile.configure(settings.limits, settings.transition_time, settings.drive)
         self._plausible.configure(
             settings.gains, settings.drive, settings.implausible_jump, settings.reference_delay
         )
         if bool(old.reference_delay) != bool(settings.reference_delay):
-            self._path.start(self.reference.velocity)  # its past is older than that
+            self._path.start(self.reference.velocity)  # the history is outdated
 
-    def renew_speed(self) -> None:
-        """Make the speed's source anew from the settings."""
-        if self._late:
-            self._trust(True)
+    def rebuild_speed_source(self) -> None:
+        """Create the speed source from the settings."""
+        if self._extra_lag:
+            self._switch_gains(True)
         self._observer: SpeedObserver | None = None
         self._differenced: DifferencedSpeed | None = None
         self._count: int | None = None  # of the last sample
@@ -153,10 +158,10 @@ class WheelLoop:
         self._differenced = DifferencedSpeed(self._encoder, self.settings.difference_window)
         self._speed_of = self._difference
         if self.settings.speed_source == "observer":
-            self._speed_of = self._learn
+            self._speed_of = self._difference_and_learn
 
     def reset_speed(self) -> None:
-        """Forget past samples, as after lost feedback."""
+        """Discard past samples, as after lost feedback."""
         self._plausible.reset()
         self._restart()
 
@@ -167,17 +172,17 @@ class WheelLoop:
             self._observer.reset()
 
     def speed(self, dt: float, velocity: float, count: int, voltage: float) -> float:
-        """Return the wheel's speed after one more sample, NaN where it is not known or jumps."""
+        """Return the wheel's speed after one more sample; NaN if unknown or implausible."""
         bits = self._width.step(count)
         if bits and self._encoder is not None and self._encoder.bits != bits:
             self.wraps_at = bits
             self._encoder = replace(self._encoder, bits=bits)
-            self.renew_speed()
+            self.rebuild_speed_source()
         speed = self._speed_of(dt, velocity, count, voltage)
         if speed != speed:
             return speed
         resolution = self._one_count(dt)
-        # Counts that jump beyond what is plausible are left out without knowing the motor.
+        # Jumps of counts are detected elsewhere, without the motor's model.
         asked = self.profile.target if self.source == "measured" else math.inf
         if self._plausible.accepts(speed, dt, voltage, resolution, asked):
             return speed
@@ -186,7 +191,7 @@ class WheelLoop:
         return math.nan
 
     def _one_count(self, dt: float) -> float:
-        """Return what one count more adds to a speed that is differenced from counts [rad/s]."""
+        """Return the change of the differenced speed by one count [rad/s]."""
         if self._count is None or self._gearbox is None or self._encoder is None or not dt > 0.0:
             return 0.0
         over = 1 if self._differenced is None else self.settings.difference_window
@@ -194,7 +199,7 @@ class WheelLoop:
 
     def _measured(self, dt: float, velocity: float, count: int, voltage: float) -> float:
         self.source = "measured"
-        self._count = count or None  # 0: of hardware without counts
+        self._count = count or None  # 0: hardware without an encoder
         return velocity
 
     def _difference(self, dt: float, velocity: float, count: int, voltage: float) -> float:
@@ -204,10 +209,12 @@ class WheelLoop:
         self._time += dt
         return self._gearbox.to_wheel(self._differenced.step(self._time, count))
 
-    def _learn(self, dt: float, velocity: float, count: int, voltage: float) -> float:
-        """Difference until the usual interval is known, then start the observer."""
+    def _difference_and_learn(
+        self, dt: float, velocity: float, count: int, voltage: float
+    ) -> float:
+        """Difference counts until the sampling interval is known, then start the observer."""
         self._intervals.append(dt)
-        if len(self._intervals) >= LEARNING:
+        if len(self._intervals) >= INTERVAL_SAMPLES:
             usual = sorted(self._intervals)[len(self._intervals) // 2]
             settings = self.settings
             assert settings.model is not None and self._encoder is not None
@@ -230,46 +237,46 @@ class WheelLoop:
         speed = observer.step(count, voltage, dt)
         trusted = observer.trusted
         self.source = "observer" if trusted else "difference (observer not trusted)"
-        if trusted == (self._late > 0.0):
-            self._trust(trusted, dt)
+        if trusted == (self._extra_lag > 0.0):
+            self._switch_gains(trusted, dt)
         return self._gearbox.to_wheel(speed)
 
-    def _trust(self, observer: bool, dt: float = 0.0) -> None:
-        """Go on with the gains for the observer, or those for counts differenced in its place.
+    def _switch_gains(self, observer: bool, dt: float = 0.0) -> None:
+        """Switch between the gains for the observer and those for differenced counts.
 
-        The integral of a command beyond its clamps is no load's, and is not kept.
+        The integral of a saturated command is not kept.
         """
-        self._late = 0.0 if observer else 0.5 * self.settings.difference_window * dt
+        self._extra_lag = 0.0 if observer else 0.5 * self.settings.difference_window * dt
         self.pid.reset(save_i_term=observer or not self.pid.saturated)
         self.pid.set_gains(self._gains())
 
     def _gains(self) -> PidGains:
-        """Return the gains for the speed that there is."""
+        """Return the gains for the present speed source."""
         settings = self.settings
-        if not self._late:
+        if not self._extra_lag:
             return settings.gains
         assert settings.model is not None and self._gearbox is not None
         return differenced_gains(
             settings.gains,
             settings.model,
             self._gearbox.ratio,
-            self._late,
+            self._extra_lag,
             settings.difference_window,
         )
 
     def start(self, measurement: float) -> None:
-        """Close the loop on a wheel that turns at ``measurement``, without a jump."""
+        """Close the loop without a jump on a wheel that turns at ``measurement``."""
         self.pid.reset()
         self._path.start(measurement)
         self._standstill = Standstill()
 
     def halt(self) -> None:
-        """Ask for a standstill at once, wherever the reference is on its way there."""
+        """Set the reference to zero at once."""
         self._path.start(0.0)
         self.reference = self.profile.now
 
     def step(self, setpoint: float, measurement: float, dt: float) -> PidOutput:
-        """Advance reference and controller by one sample; a wheel that stands is left alone."""
+        """Advance reference and controller by one sample; hold a standing wheel."""
         count = self._count
         if count is None or setpoint != 0.0:
             self._standstill.reset()
@@ -277,7 +284,7 @@ class WheelLoop:
         held = self._standstill.voltage(count, dt)
         if held is not None:
             self.pid.reset()
-            self.pid.i_term = held  # with which it goes on when the wheel moves
+            self.pid.i_term = held  # start value when the wheel moves
             return PidOutput(held, held, 0.0, held, 0.0, 0.0, False)
         out = self._follow(setpoint, measurement, dt)
         if self.reference.velocity == 0.0:
@@ -289,11 +296,13 @@ class WheelLoop:
         if settings.reference_delay:
             path = self._path
             now = path.step(setpoint, dt)
-            delay, doubt = settings.reference_delay + self._late, settings.reference_doubt
-            nominal, compared = path.ago(delay, doubt, measurement)
-            forward = path.forward(compared, settings.gains, settings.model)
+            delay, doubt = settings.reference_delay + self._extra_lag, settings.reference_doubt
+            nominal, compared = path.delayed(delay, doubt, measurement)
+            acceleration_feedforward = path.acceleration_feedforward(
+                compared, settings.gains, settings.model
+            )
             self.reference = now._replace(velocity=nominal)
-            return self.pid.step(compared, measurement, dt, forward)
+            return self.pid.step(compared, measurement, dt, acceleration_feedforward)
         if setpoint != profile.target:
             profile.set_target(setpoint, dt)
         self.reference = reference = profile.step(dt)

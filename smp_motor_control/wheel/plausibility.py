@@ -1,35 +1,35 @@
-"""Which readings of a speed no motor can have reached since the one before."""
+# SPDX-License-Identifier: Apache-2.0
+"""Plausibility of speed readings by the motor's acceleration."""
 
 import math
 
 from smp_motor_control.pid import PidGains
 from smp_motor_control.reference.profile import Drive
 
-_GROSS = 0.5
-"""Share of the top speed by which readings may differ for whatever reason, if none is known."""
+_DEFAULT_JUMP_SHARE = 0.5
+"""Plausible jump as a fraction of the top speed, without a configured value."""
 
 
-_BLIND, _BLIND_SHARE = 10.0, 3.0
-"""By which readings may differ where the motor is not known: so much [rad/s], and so many times the
-speed that is, or that is asked for."""
+_UNKNOWN_MOTOR_JUMP, _UNKNOWN_MOTOR_SHARE = 10.0, 3.0
+"""Plausible jump for an unknown motor: constant [rad/s] plus a multiple of actual or set speed."""
 
-LOAD = 0.25
-"""Share of the voltage by which a load changes a speed whose noise is known."""
+LOAD_SHARE = 0.25
+"""Voltage of a load, as a fraction of the maximum."""
 
-_QUIET = 0.2
-"""Mean change from reading to reading, of the largest that is believed, below which one that jumps
-is none of its kind: readings in coarse steps jump all the time."""
+_MAX_QUIET_CHANGE = 0.2
+"""Mean change between readings, relative to the plausible one, below which a jump is an outlier;
+coarsely quantised readings exceed it."""
 
-_BLIND_QUIET = 0.6
-"""The same where the motor is not known: an outlier in twenty readings makes it 0.5."""
+_MAX_QUIET_CHANGE_UNKNOWN = 0.6
+"""The same for an unknown motor; one outlier in twenty readings gives 0.5."""
 
-_RISE, _FALL = 0.05, 0.005
-"""Weights of the newest change in that mean where it is larger, and smaller: coarse steps are known
-after a few, outliers in one of a hundred readings are none."""
+_RISE_WEIGHT, _FALL_WEIGHT = 0.05, 0.005
+"""Weights of a larger and of a smaller change in that mean: coarse steps are learnt quickly, rare
+outliers are not."""
 
 
 class PlausibleSpeed:
-    """Leaves out a reading that jumps where others do not, unless the next one is there, too.
+    """Reject a reading that jumps, unless the next one confirms it or readings always jump.
 
     Examples
     --------
@@ -40,42 +40,43 @@ class PlausibleSpeed:
     """
 
     def __init__(self) -> None:
-        self.gross = self.rate = math.inf  # [rad/s], [rad/s^2]: what a change may be of
+        self.gross = self.rate = math.inf  # plausible jump [rad/s] and acceleration [rad/s^2]
         self._known = True
-        self._usual = 0.0  # mean change, of the largest that is believed
+        self._usual = 0.0  # mean change, relative to the plausible one
         self._jump = self._inertia = self._load = self._back_emf = self._lag = 0.0
         self.reset()
 
     def configure(self, gains: PidGains, drive: Drive | None, jump: float, lag: float) -> None:
-        """Learn what the motor can do; where that is not known, only what nothing could do jumps.
+        """Set the motor's ability; for an unknown motor the limits are wide.
 
-        ``jump`` [rad/s] is what readings differ by for another reason, 0 where nobody knows it,
-        ``lag`` [s] by what they are late.
+        ``jump`` [rad/s] is the plausible jump, 0 if unknown, and ``lag`` [s] that of the readings.
         """
         volts, inertia = gains.u_clamp_max, gains.feedforward_acceleration
         self._known = known = drive is not None and inertia > 0.0 and math.isfinite(volts)
-        self.gross = _GROSS * drive.top_speed if drive is not None and known else math.inf
-        # At full voltage, reversed at full speed.
+        self.gross = (
+            _DEFAULT_JUMP_SHARE * drive.top_speed if drive is not None and known else math.inf
+        )
+        # Full reverse voltage at full speed.
         self.rate = 2.0 * volts / inertia if known else math.inf
         self._jump, self._inertia = jump if known else 0.0, inertia
-        self._load = gains.feedforward_static + LOAD * volts
+        self._load = gains.feedforward_static + LOAD_SHARE * volts
         self._back_emf, self._lag = gains.feedforward_velocity, lag
 
     def reset(self) -> None:
-        """Forget what was read, as after lost feedback."""
+        """Discard past readings, as after lost feedback."""
         self._kept = self._last = math.nan
-        self._drive = 0.0  # most voltage that accelerated the motor, fading with what it lags by
+        self._drive = 0.0  # peak accelerating voltage, decaying with the lag [V]
 
-    def _most(self, voltage: float, dt: float, count: float, asked: float) -> float:
-        """Return the largest change within a sample that is believed."""
+    def _max_change(self, voltage: float, dt: float, count: float, asked: float) -> float:
+        """Return the plausible change within one sample [rad/s]."""
         if not self._known:
             kept = self._kept if self._kept == self._kept else 0.0
-            return _BLIND + _BLIND_SHARE * max(abs(kept), abs(asked)) + count
+            return _UNKNOWN_MOTOR_JUMP + _UNKNOWN_MOTOR_SHARE * max(abs(kept), abs(asked)) + count
         if not self._jump:
             return max(self.gross, self.rate * dt) + count
         drive = abs(voltage - self._back_emf * self._kept) + self._load
         faded = self._drive + dt / (2.0 * (self._lag + dt)) * (drive - self._drive)
-        self._drive = drive if not drive < faded else faded  # NaN: the first
+        self._drive = drive if not drive < faded else faded  # NaN: first reading
         return self._jump + self._drive / self._inertia * dt
 
     def accepts(
@@ -86,17 +87,20 @@ class PlausibleSpeed:
         count: float = 0.0,
         asked: float = 0.0,
     ) -> bool:
-        """Tell whether a speed [rad/s] is to be believed under a voltage.
+        """Return whether a speed [rad/s] is plausible at a voltage.
 
-        ``count`` [rad/s] is what one count more adds to it, ``asked`` the reference.
+        ``count`` is the change of the speed by one count [rad/s], ``asked`` is the set-point.
         """
-        most = self._most(voltage, dt, count, asked)
+        most = self._max_change(voltage, dt, count, asked)
         last, self._last = self._last, speed
-        change = abs(speed - last)  # NaN: the first
+        change = abs(speed - last)  # NaN: first reading
         beyond = (change / most if change < most else 1.0) - self._usual
-        self._usual += (_RISE if beyond > 0.0 else _FALL) * beyond
+        self._usual += (_RISE_WEIGHT if beyond > 0.0 else _FALL_WEIGHT) * beyond
         jumps = abs(speed - self._kept) > most and not change <= most
-        if jumps and (self._jump or self._usual < (_QUIET if self._known else _BLIND_QUIET)):
+        if jumps and (
+            self._jump
+            or self._usual < (_MAX_QUIET_CHANGE if self._known else _MAX_QUIET_CHANGE_UNKNOWN)
+        ):
             return False
         self._kept = speed
         return True

@@ -1,21 +1,22 @@
-"""What ends a test of a motor: too fast, too much current."""
+# SPDX-License-Identifier: Apache-2.0
+"""Speed and current limits of a motor under test."""
 
 from dataclasses import dataclass
 
-PERSISTENCE = 0.05
-"""A limit must be exceeded for so long [s]: one bad sample stops nothing."""
+PERSISTENCE_S = 0.05
+"""Time above a limit that ends the test; a single bad sample does not."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Bounds:
-    """What a wheel under test may reach; 0 for anything."""
+    """Limits of a wheel under test; 0 means no limit."""
 
-    speed: float = 0.0  # of the wheel, either way [rad/s]
-    current: float = 0.0  # either way [A]
+    speed: float = 0.0  # absolute, of the wheel [rad/s]
+    current: float = 0.0  # absolute [A]
 
 
 class Protection:
-    """Watches the samples of one wheel under test.
+    """Check the samples of one wheel under test.
 
     Examples
     --------
@@ -29,7 +30,7 @@ class Protection:
         self._since: dict[str, float] = {}
 
     def add(self, time: float, current: float, speed: float) -> str:
-        """Take a sample, as in ``MotorState``; return why the test must end, or nothing."""
+        """Add a sample of ``MotorState``; return why the test must end, or nothing."""
         bounds = self._bounds
         if self._exceeds("speed", time, abs(speed) > bounds.speed > 0.0):
             return f"it turns at {abs(speed):.3g} rad/s, the limit is {bounds.speed:.3g} rad/s"
@@ -41,4 +42,4 @@ class Protection:
         if not beyond:
             self._since.pop(what, None)
             return False
-        return time - self._since.setdefault(what, time) >= PERSISTENCE
+        return time - self._since.setdefault(what, time) >= PERSISTENCE_S

@@ -1,29 +1,29 @@
-"""A wheel that is asked to stand, and does: the voltage that it stands with.
+# SPDX-License-Identifier: Apache-2.0
+"""Holding voltage of a wheel at standstill.
 
-Around one edge of the encoder the integral, the load that an observer sees and dry friction make a
-relay, which rocks the wheel by a count for ever.  The mean voltage of such a cycle holds it too.
-Friction may hold the wheel without: the voltage fades, until it turns out to be needed.
+Integral action, quantisation and dry friction cause a limit cycle of one count.  The mean voltage
+of the cycle replaces it; the voltage fades to zero unless the wheel moves without it.
 """
 
-STANDS = 0.3
-"""Time [s] for which a wheel has moved by no more than a count when it is taken to stand: some
-cycles of the slowest loop, of which the second half makes the mean."""
+STANDSTILL_TIME_S = 0.3
+"""Time within one count that counts as standstill: some cycles of the slowest loop; the mean is
+taken over its second half."""
 
 
-FADES = 0.5 * STANDS
-"""Time [s] in which the voltage fades: before a wheel that stands would be taken for a stall."""
+FADE_TIME_S = 0.5 * STANDSTILL_TIME_S
+"""Time in which the voltage fades, shorter than the detection of a stall."""
 
 
 class Standstill:
-    """Follows counts and voltage of a wheel while its reference is zero."""
+    """Find the holding voltage of a wheel while its reference is zero."""
 
     def __init__(self) -> None:
-        self._needed = False  # whether the wheel moved when the voltage faded, at any stop
+        self._needed = False  # whether the wheel ever moved when the voltage faded
         self.reset()
 
     def reset(self) -> None:
-        """Forget what was, as when the wheel is asked to turn."""
-        self._left = 1.0  # of the mean voltage
+        """Restart, as at a non-zero set-point."""
+        self._left = 1.0  # fraction of the mean voltage
         self._begin()
 
     def _begin(self) -> None:
@@ -31,23 +31,23 @@ class Standstill:
         self._time = self._mean_time = self._volt_seconds = 0.0
 
     def step(self, count: int, voltage: float, dt: float) -> None:
-        """Take in a sample and the voltage that it is answered with."""
+        """Add a count and the voltage commanded after it."""
         if self._moved(count):
             self._needed = self._needed or self._left < 1.0
             self._left = 1.0
             self._begin()
             self._count = count
         self._time += dt
-        if self._time > 0.5 * STANDS:
+        if self._time > 0.5 * STANDSTILL_TIME_S:
             self._mean_time += dt
             self._volt_seconds += voltage * dt
 
     def voltage(self, count: int, dt: float = 0.0) -> float | None:
-        """Return the voltage [V] of a wheel that stands at a count, None where it does not."""
-        if self._time < STANDS or self._moved(count):
+        """Return the holding voltage [V] of a wheel that stands; None if it does not."""
+        if self._time < STANDSTILL_TIME_S or self._moved(count):
             return None
         if not self._needed:
-            self._left = max(self._left - dt / FADES, 0.0)
+            self._left = max(self._left - dt / FADE_TIME_S, 0.0)
         return self._left * self._volt_seconds / self._mean_time
 
     def _moved(self, count: int) -> bool:

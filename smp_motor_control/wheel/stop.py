@@ -1,30 +1,28 @@
-"""The stop rule: ``stop_time`` after it is asked to stand, nothing drives a wheel any more.
+# SPDX-License-Identifier: Apache-2.0
+"""Stop rule: ``stop_time`` after a zero set-point the wheel is no longer driven.
 
-It is asked to by a set-point of zero, or by set-points that cease.  The reference generator brings
-the wheel to rest before that; where it does not, its reference ends at zero then.  An integral that
-still turns the wheel, as one does that winds down slowly, is dropped.
-
-Pure logic on numbers; times are seconds on a steady clock.
+Silence of set-points counts as a zero set-point.  The reference normally reaches zero earlier;
+otherwise it is set to zero, and an integral that still turns the wheel is dropped.  Times are in
+seconds on a steady clock.
 """
 
 import math
 
-STANDING = 1e-3
-"""Set-points up to this ask for a standstill [rad/s]: what is left of a joystick in its middle."""
+STANDSTILL_SETPOINT = 1e-3
+"""Set-points up to this count as zero [rad/s], such as those of a joystick at rest."""
 
-AT_REST = 0.05
-"""Speed up to which a wheel stands [rad/s]."""
+REST_SPEED = 0.05
+"""Speeds up to this count as standstill [rad/s]."""
 
-LONGEST_STOP = 10.0
-"""Largest time in which a wheel is to stand [s]."""
+MAX_STOP_TIME_S = 10.0
+"""Maximum of ``stop_time``."""
 
-WINDOW = 0.5
-"""Time over which voltage and speed are averaged to tell who turns a wheel [s]: a few counts of a
-coarse encoder at the speed at which a wheel stands."""
+AVERAGING_WINDOW_S = 0.5
+"""Averaging time of voltage and speed: a few counts of a coarse encoder at ``REST_SPEED``."""
 
 
 class StopRule:
-    """Knows since when a wheel is asked to stand, and whether its controller still drives it.
+    """Track the time of a zero set-point and whether the controller still drives the wheel.
 
     Examples
     --------
@@ -40,36 +38,36 @@ class StopRule:
         self.watch()
 
     def watch(self, driven: bool = False) -> None:
-        """Begin a window, after one in which the wheel was driven or not."""
+        """Start an averaging window; ``driven`` is the result of the previous one."""
         self._driven = driven
         self._time = self._turned = self._volt_seconds = 0.0
 
     @property
     def asked(self) -> bool:
-        """Whether the wheel is asked to stand."""
+        """Whether the set-point is zero."""
         return self._since < math.inf
 
     def ask(self, setpoint: float, now: float) -> None:
-        """Take in a set-point [rad/s]."""
-        if abs(setpoint) > STANDING:
+        """Note a set-point [rad/s]."""
+        if abs(setpoint) > STANDSTILL_SETPOINT:
             self._since = math.inf
             self.watch()
         else:
             self._since = min(self._since, now)
 
-    def overdue(self, now: float, stop_time: float) -> bool:
-        """Tell whether the wheel was asked to stand longer ago than ``stop_time``."""
+    def is_overdue(self, now: float, stop_time: float) -> bool:
+        """Return whether the set-point has been zero for longer than ``stop_time``."""
         return now - self._since > stop_time
 
     def is_driven(self, dt: float, voltage: float, velocity: float) -> bool:
-        """Tell whether a voltage turned the wheel [rad/s] in its direction over the last window.
+        """Return whether the wheel turned in the direction of the voltage over the last window.
 
-        What pushes a wheel, or a slope, turns it against the voltage.
+        A wheel that is pushed, or on a slope, turns against the voltage.
         """
         self._time += dt
         self._turned += velocity * dt
         self._volt_seconds += voltage * dt
-        if self._time >= WINDOW:
+        if self._time >= AVERAGING_WINDOW_S:
             forward = self._turned * self._volt_seconds > 0.0
-            self.watch(driven=forward and abs(self._turned) > AT_REST * self._time)
+            self.watch(driven=forward and abs(self._turned) > REST_SPEED * self._time)
         return self._driven
