@@ -1,4 +1,5 @@
-"""The rest of a robot for tests of skid_steer: commands, feedback, and what it sends."""
+# SPDX-License-Identifier: Apache-2.0
+"""Peer of skid_steer in tests: it sends commands and feedback, and stores its messages."""
 
 from __future__ import annotations
 
@@ -66,7 +67,7 @@ class Peer(DomainNode):
             self.feed(wheel, left if wheel.endswith("left") else right)
 
     def roll(self, speed: float) -> None:
-        """Feed where wheels of this speed [rad/s] are at the instant that is stamped."""
+        """Send the positions of wheels with this speed [rad/s] at the stamped instant."""
         now = self.node.get_clock().now()
         self.begun = self.begun or now
         for wheel in WHEELS:

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Headless Chromium as a test drives it: over a pipe, by its own protocol, without a network."""
 
 from __future__ import annotations
@@ -20,12 +21,12 @@ CHROMIUM = next(
 
 
 class Browser:
-    """One page of a browser, and all that it asked for or complained about.
+    """One page of a browser with its requests and errors.
 
     Parameters
     ----------
     profile : Path
-        Folder for what the browser writes.
+        Folder for the browser's files.
     """
 
     def __init__(self, profile: Path) -> None:
@@ -136,7 +137,7 @@ class Browser:
         return answer["result"].get("value")
 
     def picture(self, path: Path, *selectors: str, margin: int = 12) -> None:
-        """Write the page as PNG, or the part of it that holds the elements of the selectors."""
+        """Write the page as PNG, or the part with the elements of the selectors."""
         size = self.ask("Page.getLayoutMetrics")["cssContentSize"]
         left, top, right, bottom = size["x"], size["y"], size["width"], size["height"]
         if selectors:

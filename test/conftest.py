@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Fixtures for every test: a ROS domain of its own, and real processes that cannot outlive it."""
 
 from __future__ import annotations
@@ -60,14 +61,14 @@ def claim_domain() -> tuple[int, IO[str]]:
     raise RuntimeError(f"all ROS domains {DOMAINS[0]} to {DOMAINS[-1]} are in use")
 
 
-# A shell's background job and nohup ignore these; what a test starts must not inherit that.
+# A shell's background job and nohup ignore these; processes of tests must not inherit that.
 for _number in (signal.SIGINT, signal.SIGQUIT, signal.SIGHUP):
     if signal.getsignal(_number) is signal.SIG_IGN:
         _usual = signal.default_int_handler if _number == signal.SIGINT else signal.SIG_DFL
         signal.signal(_number, _usual)
 
 BUSY = 60.0
-"""What a busy machine gets beyond a free one for what must happen before a test gives up [s]."""
+"""Additional waiting time on a busy machine before a test gives up [s]."""
 
 
 LIVE = ("nodes", "system")
@@ -77,7 +78,7 @@ LIVE = ("nodes", "system")
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     """Give a test of real processes three tries: each is reported, and a defect fails them all.
 
-    A machine that stands still in the wrong tenth of a second fails a test without a defect.
+    A pause of the machine at the wrong moment fails a test without a defect.
     """
     if config.pluginmanager.hasplugin("rerunfailures"):
         for item in items:
@@ -90,7 +91,7 @@ def ros_domain(monkeypatch: pytest.MonkeyPatch) -> Iterator[int]:
     """Give the test, and every process that it starts, a ROS domain of its own on loopback."""
     domain, handle = claim_domain()
     monkeypatch.setenv("ROS_DOMAIN_ID", str(domain))
-    for name, value in loopback.environment().items():
+    for name, value in loopback.loopback_environment().items():
         monkeypatch.setenv(name, value)
     monkeypatch.delenv("ROS_STATIC_PEERS", raising=False)
     with handle:

@@ -1,4 +1,5 @@
-"""A node of a test in a ROS domain of its own, spun where the test says so."""
+# SPDX-License-Identifier: Apache-2.0
+"""A node of a test in its own ROS domain, spun by the test."""
 
 from __future__ import annotations
 

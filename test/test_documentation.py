@@ -1,8 +1,9 @@
-"""Every command that is printed is run, or is marked with what it needs and names what exists.
+# SPDX-License-Identifier: Apache-2.0
+"""Every printed command is run, or is marked with its requirements and names existing options.
 
-A fence is ``bash`` where its commands run here, page by page in their order, and ``sh`` where they
-need what tests have not: its first line says what. ``output`` is what the fence before it prints,
-and the ``python`` of a tutorial runs in its place.
+A fence is ``bash`` if its commands run here, page by page in order, and ``sh`` if they need
+something else: its first line names it.  ``output`` is printed by the fence before it, and the
+``python`` of a tutorial runs in order.
 """
 
 from __future__ import annotations
@@ -98,7 +99,7 @@ def test_fences_say_whether_their_commands_run_here(page):
 
 
 @pytest.mark.parametrize(("page", "lines"), of_language("sh"))
-def test_commands_that_do_not_run_here_name_what_exists(page, lines):
+def test_commands_that_do_not_run_here_name_existing_options(page, lines):
     for words in commands(lines):
         name, arguments = words[0], words[1:]
         if name == "ros2" and words[1:3] == ["run", "smp_motor_control"]:
@@ -277,7 +278,7 @@ def test_commands_run_in_the_order_of_their_page(page, inputs, tmp_path, monkeyp
                 printed = out.splitlines()
 
 
-def test_the_driver_of_the_page_publishes_what_its_board_counts_and_obeys():
+def test_the_driver_of_the_page_publishes_counts_and_applies_commands():
     names: dict[str, object] = {}
     exec(compile(program("docs/howto/your-hardware.md", "python"), "your-hardware", "exec"), names)
     counts, applied = iter((2**15 - 1, -(2**15))), []
@@ -370,7 +371,7 @@ def test_the_firmware_of_the_page_drops_commands_that_waited_in_a_queue(tmp_path
     assert duty == [0, 63, 0, 0, 0, 0, 127]
 
 
-def test_layouts_draw_what_the_wheels_publish():
+def test_layouts_use_topics_that_the_wheels_publish():
     text = (ROOT / "smp_interfaces/msg/PidState.msg").read_text()
     fields = {line.split()[1] for line in text.splitlines() if line and line[0] not in "#"}
     topics = {f"/{wheel}/pid_state" for wheel in WHEELS}
@@ -383,7 +384,7 @@ def test_layouts_draw_what_the_wheels_publish():
     assert {field for _, field in drawn} <= fields
 
 
-def test_the_page_of_nodes_is_what_the_nodes_say():
+def test_the_page_of_nodes_matches_the_nodes():
     made = subprocess.run(
         [sys.executable, ROOT / "scripts/nodes.py"], check=True, capture_output=True, text=True
     )
@@ -413,7 +414,7 @@ def test_our_names_in_the_table_of_ros2_controllers_are_parameters():
         assert all(row[2].strip() or row[3].strip() for row in rows)  # nothing without a reason
 
 
-def test_data_blocks_are_what_they_say():
+def test_data_blocks_are_valid():
     for _, lines in of_language("yaml"):
         assert yaml.safe_load("\n".join(lines))
     for _, lines in of_language("xml"):

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The documentation as its readers meet it: one index, every page within a telephone's width."""
 
 from __future__ import annotations

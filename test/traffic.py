@@ -1,4 +1,5 @@
-"""Topics and bags that the tests of record and play share."""
+# SPDX-License-Identifier: Apache-2.0
+"""Topics and bags for the tests of record and play."""
 
 from __future__ import annotations
 
@@ -65,7 +66,7 @@ def contents(bag: Path) -> dict[str, list[bytes]]:
 def publish_steadily(
     publishers: list[Any], count: int, rate: float, make: Callable[[int], Any] = state
 ) -> list[bytes]:
-    """Publish at a rate; what is late is made up for, nothing is left out."""
+    """Publish at a rate; catch up after delays, and skip nothing."""
     sent = []
     begin = time.monotonic()
     for k in range(count):

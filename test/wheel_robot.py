@@ -1,4 +1,5 @@
-"""The rest of a robot for tests of nodes: sends set-points and feedback, keeps what comes back."""
+# SPDX-License-Identifier: Apache-2.0
+"""Peer of nodes in tests: it sends set-points and feedback, and stores the messages."""
 
 from __future__ import annotations
 
@@ -111,7 +112,7 @@ class Relay:
 
 
 class WheelRobot(DomainNode):
-    """Publishes set-points while spinning and remembers what the wheels do."""
+    """Publish set-points while spinning and store the wheels' states."""
 
     def __init__(self, domain: int) -> None:
         super().__init__(domain, "robot")
@@ -195,7 +196,7 @@ class WheelRobot(DomainNode):
         return bool(self._call(ChangeState, f"/{node}/change_state", request).success)
 
     def trigger(self, node: str, service: str) -> str:
-        """Call a ``std_srvs/Trigger`` of a node; return what it answers."""
+        """Call a ``std_srvs/Trigger`` of a node; return its message."""
         return str(self._call(Trigger, f"/{node}/{service}", Trigger.Request()).message)
 
     def _call(self, kind: object, name: str, request: object) -> object:

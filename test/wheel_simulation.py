@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """One wheel in open and closed loop without ROS, faster than real time.
 
 Made of the parts that run on the robot: :class:`~smp_motor_control.motor.hardware.DrivenMotor`
@@ -133,7 +134,9 @@ def simulate_closed_loop(
 ) -> Run:
     """Let a wheel's loop follow set-points."""
     limit = 1.5 * entry.supply_voltage
-    loop = WheelLoop(settings.within(entry.supply_voltage), entry.gearbox, entry.encoder, limit)
+    loop = WheelLoop(
+        settings.clamp_to_supply(entry.supply_voltage), entry.gearbox, entry.encoder, limit
+    )
 
     def answer(time: float, dt: float, sample: Sample) -> tuple[float, tuple[float, float, float]]:
         target, command, measurement = setpoint(time), 0.0, math.nan

@@ -1,4 +1,5 @@
-"""One wheel under its controller with the time passed in, and what may go wrong with it.
+# SPDX-License-Identifier: Apache-2.0
+"""One wheel under its controller, with time passed in and faults to inject.
 
 The motor is the tests' own: first order, 0.36 rad/s per volt at the wheel, 50 ms; 100 Hz.
 """

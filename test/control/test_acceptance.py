@@ -1,4 +1,5 @@
-"""Which gains a wheel takes: what is refused, why, and that what is accepted can be driven with."""
+# SPDX-License-Identifier: Apache-2.0
+"""Acceptance of gains: refusals with their reasons, and driving with accepted gains."""
 
 from __future__ import annotations
 
@@ -16,7 +17,7 @@ from smp_motor_control.motor.parameters import Gearbox
 from smp_motor_control.observer import ObserverNoise
 from smp_motor_control.pid import STRATEGIES, PidGains, PidOutput
 from smp_motor_control.reference.profile import Drive, ProfileLimits
-from smp_motor_control.wheel.acceptance import Circumstances, check
+from smp_motor_control.wheel.acceptance import OperatingConditions, check
 from smp_motor_control.wheel.loop import SPEED_SOURCES, LoopSettings, WheelLoop
 
 GAIN, TAU, RATIO, SUPPLY = 25.0, 0.05, 65.5, 12.0
@@ -25,7 +26,7 @@ GAINS = PidGains(
     p=2.0, i=60.0, u_clamp_min=-SUPPLY, u_clamp_max=SUPPLY, antiwindup_strategy="back_calculation",
     feedforward_velocity=RATIO / GAIN, feedforward_acceleration=RATIO / GAIN * TAU,
 )  # fmt: skip
-WHEEL = Circumstances(sample_time=0.005, supply=SUPPLY, gearbox=Gearbox(RATIO))
+WHEEL = OperatingConditions(sample_time=0.005, supply=SUPPLY, gearbox=Gearbox(RATIO))
 
 
 def settings(**gains: object) -> LoopSettings:
@@ -102,7 +103,7 @@ def test_limit_of_stability_is_that_of_the_sampled_loop(delay, late):
         check(replace(settings(p=1.03 * largest, **QUIET), model=model), WHEEL)
 
 
-def test_refusal_says_by_how_much_at_which_interval():
+def test_refusal_names_the_excess_and_the_interval():
     largest = limit(0.005)
     with pytest.raises(ParameterError, match=r"stable with [\d.]+ times these") as refused:
         check(settings(p=4 * largest, **QUIET), WHEEL)
@@ -152,38 +153,38 @@ def limit_with_winding(dt: float) -> float:
 def test_feed_forward_of_another_motor_is_refused_by_how_fast_it_would_drive(
     factor, static, reached
 ):
-    # Feed-forward alone for a fifth of what 12 V, less friction, reach; at most those 12 V.
+    # Feed-forward alone for a fifth of the speed at 12 V less friction; at most those 12 V.
     given = settings(p=0.0, i=0.0, feedforward_velocity=factor * RATIO / GAIN,
                      feedforward_acceleration=0.0)  # fmt: skip
     model = replace(MODEL, static_voltage=static)
-    with pytest.raises(ParameterError, match="times its set-point") as refused:
+    with pytest.raises(ParameterError, match="times the set-point") as refused:
         check(replace(given, model=model), WHEEL)
-    said = float(str(refused.value).split("reach ")[1].split()[0])
+    said = float(str(refused.value).split("reaches ")[1].split()[0])
     assert said == pytest.approx(reached, rel=0.01)
     if not static:  # a slow wheel's, too
-        with pytest.raises(ParameterError, match=f"reach {reached if factor < 5 else factor:g} "):
+        with pytest.raises(ParameterError, match=f"reaches {reached if factor < 5 else factor:g} "):
             check(replace(given, limits=ProfileLimits(velocity=0.01)), WHEEL)
 
 
-def test_set_point_of_the_trial_is_a_fifth_of_what_the_clamps_and_12_v_allow():
+def test_set_point_of_the_trial_is_a_fifth_of_the_range_of_clamps_and_12_v():
     double = dict(p=0.0, i=0.0, feedforward_acceleration=0.0)
     weak = settings(feedforward_velocity=2.1 * RATIO / GAIN, u_clamp_min=-3.0, u_clamp_max=5.0,
                     **double)  # fmt: skip
-    with pytest.raises(ParameterError, match=r"reach 2\.1 times"):  # of 0.6 V; 1.26 V of 5 V
+    with pytest.raises(ParameterError, match=r"reaches 2\.1 times"):  # of 0.6 V; 1.26 V of 5 V
         check(weak, WHEEL)
     strong = settings(feedforward_velocity=12.0 * RATIO / GAIN, u_clamp_min=-24.0,
                       u_clamp_max=24.0, **double)  # fmt: skip
-    with pytest.raises(ParameterError, match="reach 10 times"):  # 24 V, and 2.4 V are due
+    with pytest.raises(ParameterError, match="reaches 10 times"):  # 24 V, and 2.4 V are due
         check(strong, replace(WHEEL, supply=24.0))
 
 
 def test_speed_that_is_differenced_over_many_samples_is_tried_with_its_delay():
-    # Half of 20 samples late, beside 1.5 of the loop: the limit of p is a fraction of what it was.
+    # A lag of half of 20 samples, in addition to the loop's 1.5, reduces the limit of p.
     largest = limit(0.005)
     counted = replace(WHEEL, encoder=Encoder(counts_per_revolution=4000.0))
     late = replace(settings(p=0.6 * largest, **QUIET), speed_source="difference")
     check(replace(late, difference_window=1), counted)
-    with pytest.raises(ParameterError, match="times its set-point"):
+    with pytest.raises(ParameterError, match="times the set-point"):
         check(replace(late, difference_window=20), counted)
 
 
@@ -225,18 +226,18 @@ def test_arithmetic_that_fails_is_refused_in_words(monkeypatch):
         check(LoopSettings(gains=GAINS))
 
 
-def test_output_that_is_no_number_is_refused_on_anybodys_motor(monkeypatch):
+def test_non_finite_output_is_refused_for_any_motor(monkeypatch):
     nothing = PidOutput(*[math.nan] * 6, False)
     monkeypatch.setattr(WheelLoop, "step", lambda *_: nothing)
-    with pytest.raises(ParameterError, match="reach nan times"):
+    with pytest.raises(ParameterError, match="reaches nan times"):
         check(LoopSettings(gains=PidGains()))
 
 
-def test_gains_that_grow_on_nobodys_motor_are_not_judged():
+def test_gains_without_a_motor_model_are_not_tested_for_stability():
     check(LoopSettings(gains=PidGains(p=1e5)))
 
 
-def test_feed_forward_of_almost_twice_what_the_motor_takes_is_accepted():
+def test_feed_forward_of_almost_twice_the_needed_voltage_is_accepted():
     check(settings(p=0.0, i=0.0, feedforward_velocity=1.95 * RATIO / GAIN,
                    feedforward_acceleration=0.0), WHEEL)  # fmt: skip
 
@@ -334,7 +335,7 @@ def random_settings(draw: random.Random) -> LoopSettings:
 
 
 def exact_step(model: MotorModel, ratio: float, dt: float) -> np.ndarray:
-    """Return what a held voltage does to (speed, its rate) within a sample, by the test's own sum.
+    """Return the transition of (speed, its rate) over a sample of held voltage, by a series.
 
     ``tp w'' + tau w' + w = K u`` as a matrix exponential: scaled, 12 terms, squared again; a motor
     of first order has an electrical time constant of a thousandth of its own.
@@ -353,9 +354,9 @@ def exact_step(model: MotorModel, ratio: float, dt: float) -> np.ndarray:
 
 
 def drives(given: LoopSettings, ratio: float) -> float:
-    """Return how far the identified motor gets, in set-points, by settings that were accepted."""
+    """Return the largest speed of the identified motor with accepted settings, in set-points."""
     model, dt = given.model, 0.005
-    loop = WheelLoop(given.within(SUPPLY))
+    loop = WheelLoop(given.clamp_to_supply(SUPPLY))
     loop.start(0.0)
     with np.errstate(all="ignore"):
         step = exact_step(model, ratio, dt)
@@ -371,7 +372,7 @@ def drives(given: LoopSettings, ratio: float) -> float:
 
 
 def accepted_sets(draw: random.Random, count: int):
-    """Yield those of random settings that are accepted, and by how far each overshoots."""
+    """Yield the accepted ones of random settings, and the overshoot of each."""
     for _ in range(count):
         try:
             given = random_settings(draw)

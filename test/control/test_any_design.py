@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """No motor, period or accepted setting ends a running loop."""
 
 from __future__ import annotations
@@ -70,7 +71,9 @@ def drive_a_wheel(
 ) -> float:
     """Run a loop on its motor; return the largest voltage that it asked for."""
     plant = DrivenMotor(entry, DriveSettings(command_timeout=math.inf))
-    loop = WheelLoop(settings.within(entry.supply_voltage), entry.gearbox, entry.encoder, 18.0)
+    loop = WheelLoop(
+        settings.clamp_to_supply(entry.supply_voltage), entry.gearbox, entry.encoder, 18.0
+    )
     largest, time = 0.0, 0.0
     for k in range(steps):
         time += dt
@@ -178,8 +181,8 @@ def run_extremes(count: int, seed: int) -> int:
     return refused
 
 
-def test_what_is_accepted_never_ends_the_loop() -> None:
-    assert run_extremes(60, seed=8) > 60  # most of what is drawn is absurd
+def test_accepted_settings_never_end_the_loop() -> None:
+    assert run_extremes(60, seed=8) > 60  # most of the draws are absurd
 
 
 @pytest.mark.parametrize("electrical", [1e-5, 1e-4, 1e-3])

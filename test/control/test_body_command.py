@@ -1,4 +1,5 @@
-"""How long a velocity command holds (behaviour_cases of diff_drive_cases.json)."""
+# SPDX-License-Identifier: Apache-2.0
+"""Time-out of a velocity command (behaviour_cases of diff_drive_cases.json)."""
 
 from __future__ import annotations
 
@@ -59,7 +60,7 @@ def test_stamp_from_the_future_does_not_hold_any_longer() -> None:
 
 
 @pytest.mark.parametrize("bad", [(math.nan, 0.0), (0.0, math.inf), (-math.inf, math.nan)])
-def test_command_that_is_not_finite_is_no_sign_of_life(bad: tuple) -> None:
+def test_non_finite_command_does_not_reset_the_time_out(bad: tuple) -> None:
     command = BodyCommand(0.5)
     command.receive(1.0, 0.5, 0.0, 10.0)
     for k in range(1, 11):

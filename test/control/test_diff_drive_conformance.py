@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Every case of test/data/conformance/diff_drive_cases.json that has numbers.
 
 The behaviour of the running node on time-outs, stamps and NaN: test_body_command.py for the
@@ -120,11 +121,11 @@ def test_odometry_ends_where_the_wheels_lead(case: dict) -> None:
     expected = dict(case["expect"])
     if any(update["type"] == "wheel_position" for update in case["updates"]):
         if case["id"] == "first_position_offset_gotcha":
-            # Known to be wrong there: the first reading, whatever it is, is no motion here.
+            # A known fault there: the first reading is never motion here.
             assert not apply(odometry, case["updates"][0])
             assert odometry.x == 0.0
             return
-        # What their test takes for granted, wheels that were at 0, is said here.
+        # Their test assumes wheels at 0.
         odometry.update_from_position(0.0, 0.0, 1.0)
     for update in case["updates"]:
         for _ in range(update.get("repeat", 1)):

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Counts from angles, rollover of counters of any width, speed from counts."""
 
 from __future__ import annotations
@@ -91,7 +92,7 @@ def test_a_width_that_no_counter_has_is_refused_wherever_it_is_given(bits):
             make()
 
 
-def test_what_never_wraps_and_what_is_empty_comes_back_as_a_copy():
+def test_counts_without_wraps_and_empty_ones_are_copied():
     counts = np.array([0, 200, -300, 2**40])
     for bits, shown in ((0, counts), (8, counts[:0])):
         result = unwrap(shown, bits)

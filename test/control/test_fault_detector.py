@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Every limit of the fault detection to the sample; steps of 1/64 s, so that sums are exact."""
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ ABOVE = 1.0 + 2.0**-30
 def found(
     samples: Iterable[tuple[float, float, float]], limits: FaultLimits = LIMITS, detector=None
 ) -> tuple[int, Fault | None]:
-    """Return at which (V, rad/s, A) the detector speaks, from 1, and what it says."""
+    """Return the first of (V, rad/s, A), counted from 1, with a fault, and the fault."""
     detector = detector or FaultDetector(limits)
     for k, sample in enumerate(samples, 1):
         fault = detector.step(DT, *sample)
@@ -46,7 +47,7 @@ def test_limits_are_those_of_the_table_of_faults() -> None:
 
 
 @pytest.mark.parametrize("value", [-1e-9, math.inf, math.nan])
-def test_a_limit_that_is_no_limit_is_refused_and_zero_is_one(value: float) -> None:
+def test_an_invalid_limit_is_refused_and_zero_is_valid(value: float) -> None:
     for name in asdict(LIMITS):
         with pytest.raises(ValueError, match=name):
             replace(LIMITS, **{name: value})
@@ -110,7 +111,7 @@ def test_the_current_tells_a_stall_from_a_dead_encoder(current, resistance, faul
 
 
 @pytest.mark.parametrize("sample", [(6.0, 1.0, 9.0), (6.0, 0.0, 0.0), (6.0, -1.0, 0.0)])
-def test_a_reset_forgets_what_was_counted(sample: tuple[float, float, float]) -> None:
+def test_a_reset_clears_the_counts(sample: tuple[float, float, float]) -> None:
     detector = FaultDetector(LIMITS)
     first, fault = found(repeat(sample, 99), detector=FaultDetector(LIMITS))
     assert found(repeat(sample, first - 1), detector=detector) == (0, None)
@@ -121,7 +122,7 @@ def test_a_reset_forgets_what_was_counted(sample: tuple[float, float, float]) ->
 def followed(
     *parts: tuple, limits: FaultLimits = LIMITS, kv: float = math.nan, static: float = 0.0
 ):
-    """Return at which window the detector speaks, from 1; parts: reference, speed, V, saturated."""
+    """Return the first window with a fault, from 1; parts: reference, speed, V, saturated."""
     detector = FaultDetector(limits)
     detector.volts_per_speed, detector.static_voltage = kv, static
     for k, part in enumerate(parts, 1):
@@ -151,7 +152,7 @@ def test_an_error_that_shrinks_by_a_twentieth_is_a_wheel_that_accelerates() -> N
     assert followed((2.0, 0.2, 6.0, False), (2.0, 0.30, 6.0, False))[0] == 0  # 1.8 to 1.70
 
 
-def test_a_wheel_that_turns_back_more_slowly_than_asked_is_no_fault() -> None:
+def test_a_wheel_that_reverses_more_slowly_than_its_reference_is_not_a_fault() -> None:
     """Its error grows while the reference goes over to the other direction, and it slows down."""
     asked = (-0.3, -0.9, 6.0, False), (2.0, -0.6, 6.0, False), (2.0, -0.2, 6.0, False)
     assert followed(*asked) == (0, None)
@@ -167,14 +168,14 @@ def test_means_are_compared_and_not_samples() -> None:
 
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])
-def test_at_the_limit_of_the_voltage_only_what_it_is_good_for_is_asked(sign: float) -> None:
+def test_at_the_voltage_limit_only_the_speed_it_allows_is_expected(sign: float) -> None:
     def at(speed: float) -> tuple:
         return (sign * 10.0, sign * speed, sign * 12.0, True)
 
-    # By the model (12 - 0.5)/2 = 5.75, of which 2.875 + 0.3 may be missing.
+    # By the model (12 - 0.5)/2 = 5.75; the tolerated error is 2.875 + 0.3.
     assert followed(at(2.5), at(2.5), kv=2.0, static=0.5) == (2, Fault.NOT_FOLLOWING)
     assert followed(at(2.65), at(2.65), kv=2.0, static=0.5) == (0, None)
-    # A voltage below that of friction is good for nothing.
+    # A voltage below that of friction moves nothing.
     weak = (sign * 10.0, 0.0, sign * 0.4, True)
     assert followed(weak, weak, kv=2.0, static=0.5) == (0, None)
     # Unknown: 0.7 of the set-point and 0.3 may be missing, 2.7 must be there.
@@ -199,7 +200,7 @@ def test_volts_per_speed_are_learnt_while_the_wheel_follows(learning, learns) ->
     # At 2.0: enough of 3.8, too little of 10.
     at = (10.0, 2.0, 12.0, True)
     assert followed((*learning, False), at, at)[0] == (0 if learns else 3)
-    # Of what is learnt, 1.9 + 0.3 may be missing.
+    # The tolerated error of the learnt speed is 1.9 + 0.3.
     if learns:
         slow = (10.0, 1.55, 12.0, True)
         assert followed((*learning, False), slow, slow)[0] == 3
@@ -247,7 +248,7 @@ def test_a_set_point_of_zero_and_counts_release_a_wheel_before_its_pause() -> No
 def test_a_try_is_trusted_after_its_time_and_proven_after_two_seconds() -> None:
     recovery, most = Recovery(), 1.05 * 4.0
     recovery.set(Fault.RUNAWAY, 0.0)
-    turn = lambda volts, speed: recovery.limited(volts, speed, 0.125, LIMITS)  # noqa: E731
+    turn = lambda volts, speed: recovery.limit_voltage(volts, speed, 0.125, LIMITS)  # noqa: E731
     assert turn(12.0, SLOW) == most and turn(-12.0, -SLOW) == -most and turn(3.0, 1.0) == 3.0
     # 0.6 s are five samples of 0.125 s; one of standing still begins them anew.
     assert [turn(12.0, 1.0) for _ in range(3)] == [most] * 3
@@ -258,10 +259,10 @@ def test_a_try_is_trusted_after_its_time_and_proven_after_two_seconds() -> None:
     assert turn(-12.0, -1.0) == -12.0
     assert (recovery.failures, recovery.cautious) == (0, False)
     recovery.set(Fault.RUNAWAY, 0.0)
-    assert turn(12.0, 1.0) == most, "what was good before the fault counts no more"
+    assert turn(12.0, 1.0) == most, "good time before the fault does not count"
     again = Recovery()
     again.set(Fault.RUNAWAY, 0.0)
     for _ in range(4):
-        again.limited(12.0, 1.0, 0.125, LIMITS)
+        again.limit_voltage(12.0, 1.0, 0.125, LIMITS)
     again.set(Fault.RUNAWAY, 0.0)
-    assert again.limited(12.0, 1.0, 0.125, LIMITS) == most
+    assert again.limit_voltage(12.0, 1.0, 0.125, LIMITS) == most

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Keys to speeds, and the dead man's switch."""
 
 from __future__ import annotations
@@ -8,7 +9,7 @@ import pytest
 
 from smp_motor_control import WHEELS
 from smp_motor_control.errors import ParameterError
-from smp_motor_control.keyboard import BODY_KEYS, Keyboard, Speeds, keys_of
+from smp_motor_control.keyboard import BODY_KEYS, Keyboard, Speeds, parse_keys
 
 SPEEDS = Speeds(linear=0.2, angular=0.6, wheel=1.5, step=0.1, timeout=0.6)
 
@@ -70,10 +71,10 @@ def test_speed_steps_are_bounded_and_undo_each_other() -> None:
     assert keyboard.scale == pytest.approx(1.0)
     for _ in range(100):
         keyboard.press("+", 0.0)
-    assert keyboard.scale == Keyboard.FASTEST
+    assert keyboard.scale == Keyboard.MAX_SCALE
     for _ in range(100):
         keyboard.press("-", 0.0)
-    assert keyboard.scale == Keyboard.SLOWEST
+    assert keyboard.scale == Keyboard.MIN_SCALE
 
 
 @pytest.mark.parametrize(
@@ -89,7 +90,7 @@ def test_speed_steps_are_bounded_and_undo_each_other() -> None:
     ],
 )
 def test_characters_are_taken_for_the_keys_that_send_them(text: str, keys: list) -> None:
-    assert keys_of(text) == keys
+    assert parse_keys(text) == keys
 
 
 @pytest.mark.parametrize("name", ["linear", "angular", "wheel", "step", "timeout"])

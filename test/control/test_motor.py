@@ -1,4 +1,5 @@
-"""The motor against an independent integrator, and against what friction must do."""
+# SPDX-License-Identifier: Apache-2.0
+"""The motor compared with an independent integrator, and its friction."""
 
 from __future__ import annotations
 
@@ -150,7 +151,7 @@ def test_steady_state_is_the_dc_gain_times_voltage_above_static():
     assert motor.speed == pytest.approx(p.dc_gain * (9.0 - 0.7), rel=1e-12)
 
 
-def test_vanishing_inductance_approaches_none_at_all():
+def test_vanishing_inductance_approaches_zero_inductance():
     tiny, none = (Motor(paper_motor(4, 0.5, inductance=x)) for x in (1e-12, 0.0))
     for voltage in (5.0, -4.0, 0.2):
         tiny.step(voltage, 0.05)

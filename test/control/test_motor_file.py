@@ -1,4 +1,5 @@
-"""Motor files: what is read, and what is refused with which words."""
+# SPDX-License-Identifier: Apache-2.0
+"""Reading of motor files, and messages for invalid ones."""
 
 from __future__ import annotations
 

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The speed observer against the exact motor and counts as an encoder gives them."""
 
 from __future__ import annotations
@@ -218,7 +219,7 @@ def test_trust_comes_back_when_model_and_counts_agree_again() -> None:
     assert observer.speed == pytest.approx(motor.speed, abs=1.5)  # four deviations of 0.35
 
 
-def test_load_beyond_what_is_possible_is_not_trusted() -> None:
+def test_impossible_load_is_not_trusted() -> None:
     p = MOTORS["motor 1"]
     motor = Motor(p)
     observer = SpeedObserver(model_of(p), 0.005, ENCODER, max_load=18.0)
@@ -303,7 +304,7 @@ def test_gain_is_that_of_the_recursion_run_in_fine_steps(electrical: float) -> N
         P = F @ (P - np.outer(K, P[0])) @ F.T + Q
     K = P[:, 0] / (P[0, 0] + R)
     model = MotorModel(dc_gain=gain, time_constant=tau, time_constant_product=tp)
-    # Rounding of 5,000 products, the squared entries of which span ten decades.
+    # Rounding of 5,000 products whose squared entries span ten decades
     assert steady_gain(model, quantum, noise, dt)[:4] == pytest.approx(K, rel=1e-6)
 
 

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Odometry step by step against the arc and the covariance written down once more."""
 
 from __future__ import annotations
@@ -129,7 +130,7 @@ BAD = [math.nan, math.inf, -math.inf]
 
 
 @pytest.mark.parametrize("bad", BAD)
-def test_what_is_not_finite_changes_nothing(bad: float) -> None:
+def test_non_finite_values_change_nothing(bad: float) -> None:
     odometry = make()
     odometry.update_from_position(0.0, 0.0, 0.1)
     odometry.update_from_velocity(1.0, 2.0, 0.1)
@@ -164,7 +165,7 @@ def test_positions_of_a_wheel_that_would_be_too_fast_are_no_motion(side: int) ->
 
 @pytest.mark.parametrize("name", ["wheel_separation", "left_radius", "right_radius"])
 @pytest.mark.parametrize("value", [0.0, -0.1, math.nan, math.inf])
-def test_a_length_that_is_none_is_refused_by_name(name: str, value: float) -> None:
+def test_invalid_length_is_refused_by_name(name: str, value: float) -> None:
     lengths = {"wheel_separation": B, "left_radius": LEFT, "right_radius": RIGHT, name: value}
     with pytest.raises(ValueError, match=f"{name} is"):
         Odometry(**lengths)
@@ -201,6 +202,6 @@ def test_a_new_geometry_counts_from_the_next_step_on() -> None:
     before = odometry.covariance
     odometry.update_from_travel(1.0, 2.0 / 3.0, 0.0, 0.0)
     assert odometry.x == pytest.approx(0.1 + 0.2)
-    # Noise of zero: what is known is only carried along.
+    # With zero noise the covariance is only transported.
     carried = np.array([[1, 0, 0], [0, 1, 0.2], [0, 0, 1]])
     assert odometry.covariance == pytest.approx(carried @ before @ carried.T, abs=1e-15)

@@ -1,4 +1,5 @@
-"""A wheel that swings for ever is named, whatever gave it its gains, and no other is."""
+# SPDX-License-Identifier: Apache-2.0
+"""Sustained oscillations of a wheel are reported, and nothing else is."""
 
 from __future__ import annotations
 
@@ -15,7 +16,7 @@ from wheel_world import DT, SETTINGS, World
 from smp_motor_control.fields import parameters_in, settings_of
 from smp_motor_control.motor.file import load_motors
 from smp_motor_control.motor.hardware import DrivenMotor, DriveSettings
-from smp_motor_control.parameter_file import flat, read_parameters
+from smp_motor_control.parameter_file import flatten, read_parameters
 from smp_motor_control.pid import PidGains
 from smp_motor_control.wheel.controller import State, WheelController, WheelSettings
 from smp_motor_control.wheel.loop import LoopSettings
@@ -28,8 +29,8 @@ def given(file: str, wheel: str = "front_left") -> WheelSettings:
     """Return the settings of a parameter file, as wheel_pid makes them."""
     known = parameters_in(WheelSettings)
     values = {name: entry.default for name, entry in known.items()}
-    written = flat(read_parameters(CONFIG / file)[f"/**/{wheel}/wheel_pid"])
-    return settings_of(WheelSettings, {**values, **written})
+    format_parameters = flatten(read_parameters(CONFIG / file)[f"/**/{wheel}/wheel_pid"])
+    return settings_of(WheelSettings, {**values, **format_parameters})
 
 
 def p_alone(p: float) -> WheelSettings:
@@ -109,7 +110,7 @@ def test_a_wheel_that_is_asked_to_swing_is_not_blamed(target: Callable[[float], 
 
 @pytest.mark.parametrize("seed", range(4))
 @pytest.mark.parametrize("rate", [100.0, 200.0, 500.0])
-def test_noise_is_no_swing(rate: float, seed: int) -> None:
+def test_noise_is_not_an_oscillation(rate: float, seed: int) -> None:
     found, _ = drive(given("gains.yaml"), rate, lambda t: 1.0, 0.3, seed=seed)
     assert found == math.inf
 
@@ -138,7 +139,7 @@ def test_counts_that_come_and_go_are_no_swing() -> None:
 @pytest.mark.parametrize("reading", [-999.0, 999.0, -60.0, -12.0, 8.0, -3.0, 0.0])
 @pytest.mark.parametrize("apart", [0.5, 0.2])
 def test_a_false_reading_now_and_then_stops_no_wheel(reading: float, apart: float) -> None:
-    """Without drive.*, in which case nothing says what the motor can do."""
+    """Without drive.*, the motor's abilities are unknown."""
     world = World().run(2.0)
     every = round(apart / DT)
 
@@ -153,5 +154,5 @@ def test_a_false_reading_now_and_then_stops_no_wheel(reading: float, apart: floa
         assert world.wheel.recovery.fault is None
         worst = max(worst, abs(world.speed - 1.5))
     assert world.wheel.recovery.failures == 0 and world.wheel.state is not State.FAULT
-    # What is gross never reaches the loop: at 10 ms a reading of 8 may be a jolt.
+    # Gross outliers never reach the loop; at 10 ms a reading of 8 may be a jolt.
     assert worst < (0.1 if abs(reading) > 20.0 else 1.0)

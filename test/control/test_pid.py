@@ -1,4 +1,5 @@
-"""The PID controller beyond the cases of others."""
+# SPDX-License-Identifier: Apache-2.0
+"""The PID controller beyond the conformance cases."""
 
 from __future__ import annotations
 
@@ -180,7 +181,7 @@ def test_output_is_a_value_of_its_own() -> None:
 
 @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf, "1", None, True])
 @pytest.mark.parametrize("name", ["p", "tracking_time_constant", "feedforward_velocity"])
-def test_gain_that_is_no_finite_number_is_refused_by_name(name: str, value: object) -> None:
+def test_non_finite_gain_is_refused_by_name(name: str, value: object) -> None:
     with pytest.raises(ParameterError, match=name):
         PidGains(**{name: value})
 

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The PID against control_toolbox's published rule, on random gains and samples.
 
 The rule is that of its class ``Pid`` (branch jazzy, commit 05de3c67): error in, command out,

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Every case of test/data/conformance/pid_cases.json, to its stated tolerance."""
 
 from __future__ import annotations
@@ -47,7 +48,7 @@ def test_sequence_gives_the_numbers_of_control_toolbox(case: dict) -> None:
             pid.reset(save_i_term=step["save_i_term"])
             continue
         if step["op"] == "set_current_cmd":
-            continue  # their setter does not reach the next command; here there is none
+            continue  # their setter does not affect the next command; this class has no setter
         assert step["op"] == "compute"
         arguments = (float(step["error"]), 0.0, step["dt"])
         rate = step.get("error_dot")

@@ -1,4 +1,5 @@
-"""The whole control law, both degrees of freedom, against its equations written down once more.
+# SPDX-License-Identifier: Apache-2.0
+"""The whole control law, with both degrees of freedom, compared with its equations.
 
 e = r - y,   P = p (b r - y),   D = d f(c r - y)',   F = kv r + ka a + ks sign(r or a)
 unsaturated = P + I + D + F,   output = its clamp,   I += dt (i e + anti-windup), clamped
@@ -110,7 +111,7 @@ def test_every_term_of_random_controllers_follows_the_law(seed: int) -> None:
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_change_of_gains_moves_what_the_terms_lose_into_the_integral(seed: int) -> None:
+def test_change_of_gains_keeps_the_output_by_the_integral(seed: int) -> None:
     draw = random.Random(seed)
     for _ in range(40):
         old, new = drawn_gains(draw), drawn_gains(draw)
@@ -131,7 +132,7 @@ def test_change_of_gains_moves_what_the_terms_lose_into_the_integral(seed: int) 
         law.integral = clamp(moved, new.i_clamp_min, new.i_clamp_max)
         assert pid.i_term == pytest.approx(law.integral, rel=ROUNDING, abs=ROUNDING)
         assert pid.gains is new
-        # What the next sample differences from has the new weight, too.
+        # The previous value of the next difference has the new weight, too.
         law.before = new.setpoint_weight_d * law.seen[0] - law.seen[1]
         wanted = law.step(1.0, 0.5, 0.02, 0.0, None)
         out = pid.step(1.0, 0.5, 0.02)
@@ -188,7 +189,7 @@ def test_gains_that_change_before_the_first_step_leave_the_integral_empty() -> N
     assert pid.step(2.0, 1.0, 0.1).p_term == 5.0
 
 
-def test_an_integral_gain_below_the_least_is_none_at_all() -> None:
+def test_an_integral_gain_below_the_minimum_counts_as_zero() -> None:
     for gain, grows in ((EPSILON, False), (-EPSILON, False), (3 * EPSILON, True)):
         gains = PidGains(p=0.0, i=gain, u_clamp_max=1.0, antiwindup_strategy="back_calculation",
                          tracking_time_constant=1.0, feedforward_velocity=1.0)  # fmt: skip
@@ -231,7 +232,7 @@ def test_clamps_that_leave_nothing_are_refused(clamps: dict[str, float]) -> None
     PidGains(i_clamp_min=0.0, i_clamp_max=0.0)
 
 
-def test_the_one_strategy_that_is_not_offered_says_what_does_the_same() -> None:
+def test_the_unsupported_strategy_is_refused_with_its_replacement() -> None:
     with pytest.raises(ValueError, match="'legacy' is not offered: use 'none'"):
         PidGains(antiwindup_strategy="legacy")
     with pytest.raises(ValueError, match="must be one of none"):

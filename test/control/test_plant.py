@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The driven motor: commands when they arrive, voltage as it was, sensors as they are."""
 
 from __future__ import annotations
@@ -36,7 +37,7 @@ def test_commands_act_from_the_instant_of_their_arrival():
     assert sample.voltage == pytest.approx((6.0 * 0.0054 - 3.0 * 0.0023) / 0.02, rel=1e-9)
 
 
-def test_samples_at_odd_instants_do_not_change_what_the_motor_does():
+def test_irregular_sampling_does_not_change_the_motion():
     plants = [DrivenMotor(ENTRY, IDEAL) for _ in range(2)]
     draw = np.random.default_rng(3)
     for k in range(100):
@@ -59,7 +60,7 @@ def test_voltage_goes_to_zero_exactly_at_the_time_out():
 
 
 @pytest.mark.parametrize("voltage", [math.nan, math.inf, -math.inf])
-def test_command_that_is_no_number_is_zero_volts(voltage):
+def test_non_finite_command_gives_zero_volts(voltage):
     plant = DrivenMotor(ENTRY, IDEAL)
     plant.command(0.0, 10.0)
     plant.sample(0.1)
@@ -128,7 +129,7 @@ def test_narrow_counter_wraps_and_the_position_does_not():
     )
 
 
-def test_load_at_the_wheel_slows_it_by_what_the_motor_equation_says():
+def test_load_at_the_wheel_slows_it_as_the_motor_equation_predicts():
     plant = DrivenMotor(ENTRY, IDEAL)
     plant.command(0.0, 10.0)
     plant.load(0.0, 65.5 * 0.01)
@@ -167,7 +168,7 @@ def test_a_latched_command_waits_for_the_next_sample():
         ({"leads": -1, "encoder": -1}, -1, 1),
     ],
 )
-def test_swapped_leads_turn_the_motor_and_a_swapped_encoder_what_it_shows(faults, turns, counts):
+def test_swapped_leads_reverse_the_motor_and_a_swapped_encoder_the_counts(faults, turns, counts):
     entry = dataclasses.replace(ENTRY, wiring=Wiring(**faults))
     plant = DrivenMotor(entry, IDEAL)
     plant.command(0.0, 6.0)

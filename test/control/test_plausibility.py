@@ -1,4 +1,5 @@
-"""A speed that no motor can have reached since the sample before is left out of its loop."""
+# SPDX-License-Identifier: Apache-2.0
+"""Speeds that a motor cannot have reached since the previous sample are rejected."""
 
 from types import SimpleNamespace
 
@@ -19,7 +20,7 @@ DRIVE = Drive(top_speed=10.0, time_constant=0.2)  # at 12 V it changes by 0.1 ra
 
 
 def driven(speeds, drive=DRIVE) -> tuple[WheelController, list[bool]]:
-    """Return a wheel and which of the readings it left out."""
+    """Return a wheel and the readings that it rejected."""
     quiet = FaultLimits(stall_time=0.0, runaway_time=0.0, tracking_time=0.0)
     wheel = WheelController(
         WheelSettings(loop=LoopSettings(gains=GAINS, drive=drive), faults=quiet)
@@ -39,7 +40,7 @@ def driven(speeds, drive=DRIVE) -> tuple[WheelController, list[bool]]:
 
 
 def test_a_reading_that_jumps_is_left_out_and_two_that_agree_are_not() -> None:
-    """No motor changes by half of its top speed within a sample; what hits it may."""
+    """A motor cannot change by half of its top speed within a sample, but a collision can."""
     for readings, out in (([4.9, 0.0], [False, False]), ([5.2, 0.2], [True, False]),
                           ([-9.0, -8.9, -8.9], [True, False, False])):  # fmt: skip
         wheel, left_out = driven(readings)
@@ -58,7 +59,7 @@ def test_nothing_jumps_where_the_drive_is_not_known() -> None:
 
 @pytest.mark.parametrize("steps", [6.0, 11.0])
 def test_readings_in_coarse_steps_jump_all_the_time_and_are_believed(steps: float) -> None:
-    """As of counts differenced over one sample, of which there are none or one."""
+    """As of counts differenced over one sample: zero or one."""
     rng = np.random.default_rng(1)
     wheel, left_out = driven(steps * (rng.random(2000) < 0.3))
     assert np.mean(left_out) < 0.01

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """References within limits, smooth, and on time."""
 
 from __future__ import annotations
@@ -229,7 +230,7 @@ def test_no_voltage_within_the_limit_is_faster() -> None:
         assert found.success == possible
 
 
-def test_a_small_change_takes_the_transition_time_and_a_large_one_what_voltage_allows() -> None:
+def test_a_small_change_takes_the_transition_time_and_a_large_one_is_limited_by_voltage() -> None:
     drive = Drive(top_speed=10.0, time_constant=0.05, time_constant_product=0.0008)
     profile = Profile(transition_time=0.05, drive=drive)
     durations = []
@@ -241,7 +242,7 @@ def test_a_small_change_takes_the_transition_time_and_a_large_one_what_voltage_a
     assert durations[1] == pytest.approx(0.1)  # 20 samples
 
 
-def test_an_acceleration_limit_holds_beside_the_voltage() -> None:
+def test_an_acceleration_limit_holds_in_addition_to_the_voltage() -> None:
     drive = Drive(top_speed=10.0, time_constant=0.05, time_constant_product=0.0008)
     profile = Profile(ProfileLimits(acceleration=40.0), transition_time=0.05, drive=drive)
     profile.set_target(8.0, 0.005)

@@ -1,4 +1,5 @@
-"""What ends a test of a motor."""
+# SPDX-License-Identifier: Apache-2.0
+"""Limits that end a test of a motor."""
 
 from __future__ import annotations
 

@@ -1,4 +1,5 @@
-"""What users of other wheel drivers reported, tried on ours; each case names where."""
+# SPDX-License-Identifier: Apache-2.0
+"""Faults reported by users of other wheel drivers, with their sources."""
 
 from __future__ import annotations
 
@@ -76,8 +77,8 @@ def losing(share: float, since: float = 3.0) -> Callable[[Sample, float], Sample
 def test_an_encoder_that_loses_counts_is_suspected(gains, since, share) -> None:
     """linorobot/linorobot2 issue 154: "one of my encoder broken, so pid try to correct it"."""
     wheel = Wheel(LoopSettings(gains=gains), see=losing(share, since)).drive(5.0, 10.0)
-    assert wheel.state is State.DRIVING and wheel.strain is not None
-    voltage, needed = wheel.strain
+    assert wheel.state is State.DRIVING and wheel.overload is not None
+    voltage, needed = wheel.overload
     assert voltage > 11.0 and needed < 4.0
 
 
@@ -92,7 +93,7 @@ def test_an_encoder_that_shows_nothing_stops_the_wheel(share) -> None:
 @pytest.mark.parametrize("gains", [GAINS, FED_FORWARD])
 def test_a_sound_wheel_is_not_suspected(gains, target) -> None:
     wheel = Wheel(LoopSettings(gains=gains)).drive(target, 8.0)
-    assert wheel.strain is None and wheel.recovery.failures == 0
+    assert wheel.overload is None and wheel.recovery.failures == 0
 
 
 @pytest.mark.parametrize("bits", [8, 16])

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The exact response against the matrix exponential, from oscillation to a pole long decayed."""
 
 from __future__ import annotations
@@ -50,7 +51,7 @@ def test_scalar_and_batched_response_are_the_same(share: float) -> None:
 
 
 def test_a_decayed_pole_leaves_the_motor_of_first_order() -> None:
-    # L/R of 1 ns beside 50 ms: the two differ by its share, 2e-8.
+    # With L/R of 1 ns and 50 ms the two differ by their ratio, 2e-8.
     second = zero_order_hold(GAIN, TAU, 1e-9 * TAU, 0.05)
     first = zero_order_hold(GAIN, TAU, 0.0, 0.05)
     assert second.forced == pytest.approx(first.forced, rel=1e-7)

@@ -1,4 +1,5 @@
-"""Kinematics, odometry and limits beyond the cases of others."""
+# SPDX-License-Identifier: Apache-2.0
+"""Kinematics, odometry and limits beyond the conformance cases."""
 
 from __future__ import annotations
 
@@ -103,7 +104,7 @@ def test_odometry_ignores_nan_and_goes_on() -> None:
     assert odometry.x == pytest.approx(0.1)
 
 
-def test_counter_that_was_reset_is_no_motion() -> None:
+def test_a_counter_reset_adds_no_motion() -> None:
     odometry = make_odometry(max_wheel_speed=5.0)
     odometry.update_from_position(100.0, 100.0, 0.02)
     assert odometry.update_from_position(100.05, 100.05, 0.02)

@@ -1,4 +1,5 @@
-"""A wheel that is asked to stand stands still, and is given what it stands with."""
+# SPDX-License-Identifier: Apache-2.0
+"""A wheel with a set-point of zero stops, and its voltage decays."""
 
 import math
 
@@ -12,7 +13,7 @@ from smp_motor_control.observer import ObserverNoise
 from smp_motor_control.pid import PidGains
 from smp_motor_control.wheel import standstill
 from smp_motor_control.wheel.loop import LoopSettings, WheelLoop
-from smp_motor_control.wheel.standstill import STANDS, Standstill
+from smp_motor_control.wheel.standstill import STANDSTILL_TIME_S, Standstill
 
 STEP, GEAR, COUNTS = 1e-3, 30.0, 271
 GAIN, TAU, SECOND, STATIC = 55.0, 0.296, 2.8e-4, 0.081
@@ -75,9 +76,9 @@ def stops(seed: int) -> np.ndarray:
 def test_a_wheel_that_rocks_by_a_count_is_left_alone(monkeypatch):
     ends = [driven(stops(seed))[0][-1_000:] for seed in range(6)]
     assert max(np.ptp(end) for end in ends) < 1e-9  # from a second after the stop
-    monkeypatch.setattr(standstill, "STANDS", math.inf)
+    monkeypatch.setattr(standstill, "STANDSTILL_TIME_S", math.inf)
     ends = [driven(stops(seed))[0][-1_000:] for seed in range(6)]
-    assert max(np.ptp(end) for end in ends) > 0.2  # [V] of what it would do else
+    assert max(np.ptp(end) for end in ends) > 0.2  # [V], without the rule
 
 
 def test_it_stands_under_a_load_and_turns_again_when_asked():
@@ -92,7 +93,7 @@ def test_it_stands_under_a_load_and_turns_again_when_asked():
 
 def test_one_count_is_standing_and_two_are_not():
     still = Standstill()
-    for k in range(round(STANDS / STEP) - 1):
+    for k in range(round(STANDSTILL_TIME_S / STEP) - 1):
         assert still.voltage(k % 2) is None
         still.step(k % 2, 1.0 if k % 2 else 0.0, STEP)
     still.step(0, 0.0, 2 * STEP)

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A wheel stands within ``stop_time`` of a zero set-point or of silence, whatever its settings."""
 
 from __future__ import annotations
@@ -14,10 +15,10 @@ from smp_motor_control.motor.model import MotorModel
 from smp_motor_control.motor.parameters import Gearbox
 from smp_motor_control.pid import PidGains
 from smp_motor_control.reference.profile import Drive, ProfileLimits
-from smp_motor_control.wheel.acceptance import Circumstances, check
+from smp_motor_control.wheel.acceptance import OperatingConditions, check
 from smp_motor_control.wheel.controller import State, WheelSettings
 from smp_motor_control.wheel.loop import LoopSettings
-from smp_motor_control.wheel.stop import AT_REST, STANDING, WINDOW
+from smp_motor_control.wheel.stop import AVERAGING_WINDOW_S, REST_SPEED, STANDSTILL_SETPOINT
 
 UNHURRIED = {
     "drive": {"drive": Drive(top_speed=3.0, time_constant=1e5)},
@@ -49,13 +50,13 @@ def test_a_reference_that_is_led_too_slowly_ends_at_the_stop_time(name, stop_tim
     world = driving(World(settings(stop_time=stop_time, **UNHURRIED[name])))
     assert world.speed > 1.0
     world.setpoint = 0.0
-    # Then the reference is zero, and what is left is the loop's own response to that.
+    # Then the reference is zero, and the rest is the loop's own response.
     world.run(stop_time + 2 * DT)
     assert world.wheel.loop.reference.velocity == 0.0 and world.held <= 0.0
     world.run(8 * TAU)
-    assert abs(world.speed) < AT_REST and world.wheel.loop.reference.velocity == 0.0
+    assert abs(world.speed) < REST_SPEED and world.wheel.loop.reference.velocity == 0.0
     world.run(10.0)
-    assert abs(world.speed) < AT_REST and world.wheel.state is State.DRIVING
+    assert abs(world.speed) < REST_SPEED and world.wheel.state is State.DRIVING
 
 
 @pytest.mark.parametrize("name", UNHURRIED)
@@ -65,7 +66,7 @@ def test_silence_ends_in_0_v_after_its_time_out_and_the_stop_time(name):
     world.run(SETPOINT_TIMEOUT + 1.0 + 2 * DT)
     assert world.held == 0.0 and world.wheel.setpoint is None
     world.run(6 * TAU)
-    assert abs(world.speed) < AT_REST
+    assert abs(world.speed) < REST_SPEED
 
 
 @pytest.mark.parametrize(
@@ -79,28 +80,28 @@ def test_silence_ends_in_0_v_after_its_time_out_and_the_stop_time(name):
 def test_an_integral_that_would_drive_on_is_dropped(gains):
     blind = replace(SETTINGS.faults, tracking_time=0.0)
     world = World(replace(settings(), faults=blind)).run(2.0)
-    # Changed without a jump: the integral takes over what the other terms gave.
+    # No jump: the integral takes over the contribution of the other terms.
     world.wheel.configure(replace(settings(gains), faults=blind))
     world.run(0.2)
     assert world.speed == pytest.approx(1.5, rel=0.1)
     world.setpoint = 0.0
-    world.run(1.0 + WINDOW + 2 * DT + 6 * TAU)
-    assert abs(world.speed) < AT_REST
+    world.run(1.0 + AVERAGING_WINDOW_S + 2 * DT + 6 * TAU)
+    assert abs(world.speed) < REST_SPEED
     (why,) = world.wheel.refused
     assert "integral" in why and world.wheel.state is State.DRIVING
 
 
-def test_a_slope_is_held_and_a_hand_that_pushes_is_no_drive():
+def test_a_slope_is_held_and_pushing_by_hand_is_not_driving():
     world = World().run(2.0)
     world.load = 3.0
     world.setpoint = 0.0
     world.run(10.0)
-    assert world.held == pytest.approx(-3.0, abs=0.1) and abs(world.speed) < AT_REST
+    assert world.held == pytest.approx(-3.0, abs=0.1) and abs(world.speed) < REST_SPEED
     world.load = 3.8
     world.run(3.0)
     assert world.held == pytest.approx(-3.8, abs=0.1)
     assert not world.wheel.refused and world.wheel.state is State.DRIVING
-    assert max(abs(speed) for _, _, speed in world.log[-100:]) < AT_REST
+    assert max(abs(speed) for _, _, speed in world.log[-100:]) < REST_SPEED
 
 
 def test_a_wheel_that_rolls_after_a_fault_does_not_say_that_it_is_driven():
@@ -116,16 +117,16 @@ def test_a_wheel_that_rolls_after_a_fault_does_not_say_that_it_is_driven():
     assert world.wheel.state is State.DRIVING
 
 
-def test_what_a_joystick_leaves_in_its_middle_asks_for_a_standstill():
+def test_the_offset_of_a_joystick_at_rest_counts_as_zero():
     world = driving(World(settings(**UNHURRIED["transition"])))
     for k in range(round(1.2 / DT)):
-        world.setpoint = (0.0, 0.9 * STANDING, -0.9 * STANDING)[k % 3]
+        world.setpoint = (0.0, 0.9 * STANDSTILL_SETPOINT, -0.9 * STANDSTILL_SETPOINT)[k % 3]
         world.step()
     world.run(6 * TAU)
-    assert abs(world.speed) < AT_REST
+    assert abs(world.speed) < REST_SPEED
 
 
-def test_a_slow_set_point_is_none_of_zero():
+def test_a_slow_set_point_does_not_count_as_zero():
     world = World().run(2.0)
     world.setpoint = 0.1
     world.run(5.0)
@@ -133,8 +134,8 @@ def test_a_slow_set_point_is_none_of_zero():
 
 
 @pytest.mark.parametrize("name", UNHURRIED)
-def test_settings_that_stand_too_late_are_refused_with_what_they_take(name):
-    with pytest.raises(ParameterError, match=r"stands .* s after a set-point of zero, and stop_"):
+def test_settings_that_stop_too_late_are_refused_with_the_time_they_take(name):
+    with pytest.raises(ParameterError, match=r"stops .* s after a set-point of zero, and stop_"):
         check(settings(**UNHURRIED[name]).loop)
 
 
@@ -148,11 +149,11 @@ def test_settings_are_taken_up_to_the_stop_time(name):
 
 def test_the_speed_that_is_braked_from_is_the_fastest_that_is_known():
     model = MotorModel(dc_gain=GAIN * 65.5, time_constant=TAU)
-    known = Circumstances(sample_time=DT, supply=SUPPLY, gearbox=Gearbox(65.5))
+    known = OperatingConditions(sample_time=DT, supply=SUPPLY, gearbox=Gearbox(65.5))
     loop = LoopSettings(gains=GAINS, model=model)
     top = GAIN * SUPPLY  # 4.32 rad/s
     check(replace(loop, limits=ProfileLimits(acceleration=1.02 * top)), known)
-    with pytest.raises(ParameterError, match=f"a wheel at {top:.3g} rad/s stands 1.02 s"):
+    with pytest.raises(ParameterError, match=f"a wheel at {top:.3g} rad/s stops 1.02 s"):
         check(replace(loop, limits=ProfileLimits(acceleration=0.98 * top)), known)
     check(replace(loop, limits=ProfileLimits(acceleration=0.6, velocity=0.5)), known)
     with pytest.raises(ParameterError, match=r"max_acceleration 0\.4: a wheel at 0\.5 rad/s"):
@@ -166,7 +167,7 @@ def test_the_speed_that_is_braked_from_is_the_fastest_that_is_known():
 @pytest.mark.parametrize(("low", "high"), [(1.0, 12.0), (-12.0, -1e-3), (5e-324, math.inf)])
 def test_clamps_that_leave_no_zero_are_refused(low, high):
     clamped = replace(GAINS, u_clamp_min=low, u_clamp_max=high)
-    with pytest.raises(ParameterError, match="driven at a set-point of zero"):
+    with pytest.raises(ParameterError, match="drives the wheel at a set-point of zero"):
         check(LoopSettings(gains=clamped))
     check(LoopSettings(gains=replace(GAINS, u_clamp_min=0.0)))
     check(LoopSettings(gains=replace(GAINS, u_clamp_max=0.0)))
@@ -192,7 +193,7 @@ def test_a_stop_begins_again_after_a_reset():
 def test_whatever_is_accepted_stands_in_time(seed):
     draw = random.Random(seed)
     model = MotorModel(dc_gain=GAIN * 65.5, time_constant=TAU)
-    known = Circumstances(sample_time=DT, supply=SUPPLY, gearbox=Gearbox(65.5))
+    known = OperatingConditions(sample_time=DT, supply=SUPPLY, gearbox=Gearbox(65.5))
     stood = 0
     for _ in range(60):
         gains = replace(GAINS, p=10 ** draw.uniform(-2, 1), i=10 ** draw.uniform(-4, 2))
@@ -217,8 +218,8 @@ def test_whatever_is_accepted_stands_in_time(seed):
         world = World(replace(settings(), loop=loop)).run(3.0)
         world.setpoint = 0.0
         # A window to see that an integral drives, and the motor's own time to come to rest.
-        world.run(loop.stop_time + WINDOW + 10 * TAU)
+        world.run(loop.stop_time + AVERAGING_WINDOW_S + 10 * TAU)
         last = [abs(speed) for _, _, speed in world.log[-round(0.2 / DT) :]]
-        assert max(last) < max(AT_REST, 0.1), loop
+        assert max(last) < max(REST_SPEED, 0.1), loop
         stood += 1
     assert stood > 10

@@ -1,4 +1,5 @@
-"""Which feedback counts, which motor misbehaves, and when it may be tried again."""
+# SPDX-License-Identifier: Apache-2.0
+"""Freshness of feedback, leases, faults of motors, and recovery."""
 
 from __future__ import annotations
 
@@ -102,7 +103,7 @@ def test_clock_that_jumps_ahead_or_after_a_gap_is_a_jump():
     assert c.age == 0.0, "counted from the new offset on"
     assert feed(c, (1605, 15)) == [Verdict.FRESH]
     assert c.jumps == 1 and c.offset == pytest.approx(-1.59) and c.age == pytest.approx(0.0)
-    # Three seconds of silence, of which the stamps know one: more than a gap, so no queue.
+    # Three seconds of silence with one by the stamps: more than a gap, so not a queue.
     assert feed(c, (2605, 3015)) == [Verdict.FIRST]
     assert c.jumps == 2 and c.offset == 0.0 and c.age == pytest.approx(0.41)
 
@@ -128,7 +129,7 @@ def test_a_new_clock_has_measured_nothing():
     assert (c.dt, c.age) == (0.0, pytest.approx(0.05))
 
 
-def test_samples_are_counted_by_what_they_are():
+def test_samples_are_counted_by_verdict():
     c = clock()
     feed(c, (0, 0), (5, 5), (10, 10), (10, 11), (7, 12), (20, 520), (900, 900))
     expected = {"FIRST": 2, "FRESH": 2, "DUPLICATE": 1, "REORDERED": 1, "LATE": 1}
@@ -159,7 +160,7 @@ def test_a_wheel_is_its_last_drivers_for_the_time_out_and_no_longer():
         ("a", 1.0, 0.0), ("b", 1.0, 0.125), ("b", 0.0, 0.125), ("b", 1.0, 0.25), timeout=0.25
     )
     assert taken == [True, False, False, True]
-    # Zeros and what is no number take and renew nothing.
+    # Zeros and non-finite commands neither take nor renew the lease.
     for value in (0.0, math.nan, math.inf):
         assert lease(("a", value, 0.0), ("b", 1.0, 0.1)) == [True, True]
         assert lease(("a", 1.0, 0.0), ("a", value, 0.15), ("b", 1.0, 0.21)) == [True, True, True]
@@ -191,13 +192,13 @@ def test_a_command_that_waited_in_a_queue_takes_no_wheel_but_zero_always_does():
         return one.take(writer, voltage, 1e-3 * now_ms, stamp_ms * ms, now_ms * ms)
 
     assert at(1000, 3.0, 995)
-    # The driver stood still; what it finds then was meant for another moment.
+    # The driver was suspended; the commands in its queue are outdated.
     assert not at(1900, 3.0, 1005)
     assert at(1900, 0.0, 1005)
     assert not at(4800, 3.0, 1910)
     assert at(4801, 3.0, 4800)
     assert one.late == 2
-    # A writer whose clock is elsewhere is judged by its own; one that stamps nothing not at all.
+    # The age of a command follows its writer's own clock; without stamps there is no age.
     assert at(6000, 3.0, 50_000, "b") and not at(6600, 3.0, 50_300, "b")
     assert at(7000, 3.0, 0, "c") and at(9000, 3.0, 0, "c")
 
@@ -254,11 +255,11 @@ def test_stall_and_dead_encoder_are_told_apart_by_the_current():
     assert detector.found is Fault.NO_MOTION
 
 
-def test_wheel_at_rest_below_the_stall_voltage_is_no_fault():
+def test_wheel_at_rest_below_the_stall_voltage_is_not_a_fault():
     assert run(FaultDetector(LIMITS), 10.0, 3.9, 0.0, 0.5) is None
 
 
-def test_wheel_that_starts_slowly_is_no_fault():
+def test_wheel_that_starts_slowly_is_not_a_fault():
     assert run(FaultDetector(LIMITS), 5.0, 12.0, lambda t: 0.0 if t < 0.4 else t, 1.0) is None
 
 
@@ -309,10 +310,10 @@ def test_try_is_limited_to_a_small_voltage_until_the_wheel_turns_as_driven():
     recovery.set(Fault.RUNAWAY, 0.0)
     recovery.may_release(1.0, 10.0)
     most = 1.05 * LIMITS.stall_voltage
-    assert recovery.limited(12.0, 0.0, 0.01, LIMITS) == most
+    assert recovery.limit_voltage(12.0, 0.0, 0.01, LIMITS) == most
     for _ in range(50):
-        assert recovery.limited(-12.0, 0.5, 0.01, LIMITS) == -most
-    trusted = [recovery.limited(12.0, 0.5, 0.01, LIMITS) for _ in range(201)]
+        assert recovery.limit_voltage(-12.0, 0.5, 0.01, LIMITS) == -most
+    trusted = [recovery.limit_voltage(12.0, 0.5, 0.01, LIMITS) for _ in range(201)]
     # Six tenths of a second of turning as driven, then two seconds until it is forgotten.
     assert trusted[:59] == [most] * 59 and trusted[61:199] == [12.0] * 138
     assert not recovery.cautious and recovery.failures == 0

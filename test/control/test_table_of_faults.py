@@ -1,4 +1,5 @@
-"""The table of faults in the documentation names tests that are there, and all of the matrix."""
+# SPDX-License-Identifier: Apache-2.0
+"""The table of faults in the documentation names existing tests, and the whole matrix."""
 
 from __future__ import annotations
 

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The fault matrix of one wheel, event by event, with the time passed in."""
 
 from __future__ import annotations
@@ -51,19 +52,19 @@ MATRIX = [
     ("set-point nan", asking(math.nan), "set-point timed out", 0.53, 1.0, 1.0),
     ("set-point inf", asking(math.inf), "set-point timed out", 0.53, 1.0, 1.0),
     ("set-point absurd", asking(-1e300), "set-point timed out", 0.53, 1.0, 1.0),
-    ("another's wheel", taken, "not yours", FRONT, FRONT, 1.0),
+    ("another's wheel", taken, "rejected", FRONT, FRONT, 1.0),
 ]
 
 
 @pytest.mark.parametrize("row", MATRIX, ids=[row[0] for row in MATRIX])
 def test_every_fault_is_named_stops_the_wheel_in_time_and_passes(row):
-    _, put, words, within, stopped, again = row
+    _, put, words, clamp_to_supply, stopped, again = row
     limits = replace(SETTINGS.faults, current_limit=5.0)
     world = World(replace(SETTINGS, faults=limits)).run(2.0)
     assert world.speed == pytest.approx(1.5, rel=0.01) and world.wheel.state is State.DRIVING
     put(world)
     begin = world.now
-    world.until(lambda: words in world.named(), within + FRONT)
+    world.until(lambda: words in world.named(), clamp_to_supply + FRONT)
     world.until(lambda: world.held == 0.0, stopped + FRONT - (world.now - begin) + DT)
     sensible(world)
     # Ten time constants to speed, after the pause and the small voltage of a try.
@@ -137,7 +138,7 @@ def test_intact_wheel_may_be_tried_as_often_as_it_was_proven_sound():
     assert world.speed == pytest.approx(1.5, rel=0.01)
 
 
-def test_set_point_of_no_number_is_no_sign_of_life_between_good_ones():
+def test_non_finite_set_points_do_not_reset_the_time_out():
     world = World().run(2.0)
     good_until = world.now
     for k in range(400):
@@ -145,7 +146,7 @@ def test_set_point_of_no_number_is_no_sign_of_life_between_good_ones():
         world.step()
     stopped = next(t for t, voltage, _ in world.log if t > good_until and voltage == 0.0)
     assert stopped - good_until < SETPOINT_TIMEOUT + 1.0
-    assert world.wheel.refused["set-point that is not a number or absurd"] == 400
+    assert world.wheel.refused["set-point that is not a number or implausible"] == 400
 
 
 def test_parameters_that_cannot_be_computed_stop_the_wheel_and_nothing_else(monkeypatch):

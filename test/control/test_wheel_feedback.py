@@ -1,4 +1,5 @@
-"""What lost, late, wrong and unequal samples of wheels add up to."""
+# SPDX-License-Identifier: Apache-2.0
+"""Travel from lost, late, wrong and unequal samples of wheels."""
 
 from __future__ import annotations
 
@@ -36,7 +37,7 @@ def test_wheels_that_report_at_different_instants_count_once() -> None:
     assert total == pytest.approx([0.995, 0.99])
 
 
-def test_first_reading_is_no_motion() -> None:
+def test_first_reading_adds_no_motion() -> None:
     feedback = make()
     feed(feedback, 0.0, "abcd", 500.0)
     assert feedback.take(0.0, TIMEOUT) is None
@@ -70,7 +71,7 @@ def test_silence_of_a_whole_side_is_told_and_not_guessed() -> None:
     [(0.02, 1e9), (0.02, -1e300), (-5.0, 1.0), (0.01, 1.0)],
     ids=["counter reset", "absurd", "time jumped back", "duplicate"],
 )
-def test_sample_that_cannot_be_is_no_motion(stamp: float, position: float) -> None:
+def test_impossible_sample_adds_no_motion(stamp: float, position: float) -> None:
     feedback = make()
     feed(feedback, 0.0, "abcd", 0.0)
     feedback.take(0.0, TIMEOUT)
@@ -107,7 +108,7 @@ def test_speed_over_a_stall_is_the_travel_over_the_time_it_was_travelled_in(stal
     assert speeds[2:] == pytest.approx([3.0] * (len(speeds) - 2))
 
 
-def test_sample_without_a_number_is_no_sign_of_life() -> None:
+def test_non_finite_sample_does_not_reset_the_time_out() -> None:
     feedback = make()
     feed(feedback, 0.0, "abcd", 0.0)
     feed(feedback, 1.0, "abcd", math.nan, math.inf)
@@ -165,7 +166,7 @@ def test_position_spikes_cost_no_way(spike: float) -> None:
         return sample._replace(position=sample.position + spike) if spoilt else sample
 
     left, right, feedback = drive(see)
-    # A position that is no number is bridged by the velocity, and the next one makes it good.
+    # A non-finite position is bridged by the velocity, and the next one corrects the sum.
     assert (left, right) == pytest.approx((8.0, 16.0), abs=0.01)
     assert not feedback.problems
 
@@ -227,7 +228,7 @@ def test_a_position_that_is_never_filled_is_named_and_the_velocity_tells_the_way
     assert abs(still) < 0.02 and not feedback.problems, "a wheel that stands is not blamed"
 
 
-def test_late_and_repeated_samples_are_no_motion_and_lose_none() -> None:
+def test_late_and_repeated_samples_neither_add_nor_lose_motion() -> None:
     late: dict[str, WheelSample] = {}
 
     def see(wheel: str, t: float, sample: WheelSample) -> WheelSample:

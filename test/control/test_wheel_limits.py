@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The limits of a wheel's controller to the sample; steps of 1/64 s, so that times are exact."""
 
 from __future__ import annotations
@@ -115,7 +116,7 @@ def test_a_wheel_that_is_braked_along_its_profile_is_not_let_go_before_its_end()
     assert feed.give(0.0) > 0.5
 
 
-def test_silence_as_long_as_its_time_out_is_none_and_its_kind_is_named() -> None:
+def test_silence_up_to_the_time_out_is_tolerated_and_a_longer_one_is_named() -> None:
     feed = Feed()
     feed.ask(1.0)
     feed.give()
@@ -129,7 +130,7 @@ def test_silence_as_long_as_its_time_out_is_none_and_its_kind_is_named() -> None
         feed = Feed()
         feed.ask(1.0)
         feed.give()
-        feed.now += 0.5  # so that the stamps of what is late go on
+        feed.now += 0.5  # so that the late stamps increase
         for _ in range(20):
             feed.give(**put)
             tick = feed.wheel.tick(feed.now)
@@ -165,7 +166,7 @@ def test_after_silence_the_loop_starts_anew_from_the_speed_that_is() -> None:
             feed.give(0.75)
         else:
             feed.wheel.owner = "/excite#1"
-            assert feed.give(0.75) == 0.0 and feed.wheel.state is State.NOT_OURS
+            assert feed.give(0.75) == 0.0 and feed.wheel.state is State.OWNED_ELSEWHERE
             feed.wheel.owner = ""
         feed.ask(1.0)
         feed.give(0.75)
@@ -224,7 +225,7 @@ def test_a_wheel_at_fault_answers_every_sample_with_zero() -> None:
         assert feed.wheel.state is State.FAULT
 
 
-def test_the_voltage_that_is_no_number_is_taken_to_be_the_one_that_was_asked_for() -> None:
+def test_a_non_finite_voltage_is_replaced_by_the_command() -> None:
     feed = Feed()
     seen: list[float] = []
     feed.wheel.loop.speed = lambda dt, velocity, count, voltage: seen.append(voltage) or velocity
@@ -284,7 +285,7 @@ def test_an_inactive_wheel_answers_nothing_and_a_reset_forgets_its_set_point() -
     assert (feed.wheel.output, feed.wheel.answer, feed.wheel.active) == (0.0, None, False)
 
 
-def test_what_an_answer_was_made_of_is_told() -> None:
+def test_the_terms_of_an_output_are_reported() -> None:
     feed = Feed()
     feed.ask(1.0)
     assert feed.give(0.25) == 1.5
@@ -296,7 +297,7 @@ def test_what_an_answer_was_made_of_is_told() -> None:
 
 
 @pytest.mark.parametrize("supply", [0.0, -12.0, math.nan, math.inf])
-def test_a_supply_that_is_none_is_refused_and_the_old_one_stays(supply: float) -> None:
+def test_an_invalid_supply_is_refused_and_the_old_one_stays(supply: float) -> None:
     feed = Feed()
     feed.wheel.set_hardware(Gearbox(1.0), Encoder(), 5.0)
     with pytest.raises(ValueError, match="supply_voltage"):
@@ -307,11 +308,11 @@ def test_a_supply_that_is_none_is_refused_and_the_old_one_stays(supply: float) -
     for low, high in ((6.0, 8.0), (-8.0, -6.0)):
         gains = replace(GAINS, u_clamp_min=low, u_clamp_max=high)
         with pytest.raises(ValueError, match="clamp"):
-            LoopSettings(gains=gains).within(5.0)
-    within = LoopSettings(gains=GAINS).within(5.0).gains
-    assert (within.u_clamp_min, within.u_clamp_max) == (-5.0, 5.0)
-    within = LoopSettings(gains=GAINS).within(50.0).gains
-    assert (within.u_clamp_min, within.u_clamp_max) == (-12.0, 12.0)
+            LoopSettings(gains=gains).clamp_to_supply(5.0)
+    clamp_to_supply = LoopSettings(gains=GAINS).clamp_to_supply(5.0).gains
+    assert (clamp_to_supply.u_clamp_min, clamp_to_supply.u_clamp_max) == (-5.0, 5.0)
+    clamp_to_supply = LoopSettings(gains=GAINS).clamp_to_supply(50.0).gains
+    assert (clamp_to_supply.u_clamp_min, clamp_to_supply.u_clamp_max) == (-12.0, 12.0)
 
 
 def test_a_change_is_judged_where_it_is_one_of_the_loop() -> None:
@@ -324,8 +325,8 @@ def test_a_change_is_judged_where_it_is_one_of_the_loop() -> None:
         given.check(replace(bad, loop=LoopSettings(gains=replace(GAINS, i=-2.0))))
 
 
-def test_what_the_voltage_is_good_for_is_what_the_feed_forward_says() -> None:
-    # (12 - 0.5)/2 = 5.75 rad/s, of which 2.875 + 0.3 may be missing.
+def test_the_speed_expected_at_a_voltage_follows_from_the_feed_forward() -> None:
+    # (12 - 0.5)/2 = 5.75 rad/s; the tolerated error is 2.875 + 0.3.
     gains = replace(GAINS, p=9.0, feedforward_velocity=2.0, feedforward_static=0.5)
     follow = replace(NO_FAULTS, tracking_time=0.75)
     known = replace(SETTINGS, loop=LoopSettings(gains=gains), faults=follow)
@@ -339,7 +340,7 @@ def test_what_the_voltage_is_good_for_is_what_the_feed_forward_says() -> None:
             assert feed.wheel.recovery.fault is fault
 
 
-def test_new_parameters_end_what_the_old_could_not_compute_and_no_other_fault() -> None:
+def test_new_parameters_clear_a_computation_fault_and_no_other() -> None:
     for fault in Fault:
         feed = Feed()
         feed.wheel.recovery.set(fault, feed.now)

@@ -1,4 +1,5 @@
-"""A wheel's loop: where its speed comes from, and what a change of its settings keeps.
+# SPDX-License-Identifier: Apache-2.0
+"""A wheel's loop: the source of its speed, and the state kept when settings change.
 
 Steps of 1/64 s, so that times are exact; the speeds are counted out by the tests.
 """
@@ -36,7 +37,7 @@ def make(source: str, **changes: object) -> WheelLoop:
 
 
 def rest(loop: WheelLoop, samples: int, voltage: float = 0.0) -> list[str]:
-    """Let the wheel stand; return where the speeds came from."""
+    """Keep the wheel at rest; return the sources of its speeds."""
     sources = []
     for _ in range(samples):
         loop.speed(DT, 9.0, 0, voltage)
@@ -55,7 +56,7 @@ def test_times_of_the_reference_are_taken_up_to_their_limits(name: str, most: fl
             LoopSettings(**{name: value})
 
 
-def test_a_speed_source_needs_what_it_is_made_of() -> None:
+def test_a_speed_source_needs_its_signals() -> None:
     assert LoopSettings().difference_window == 4
     for bad in ({"speed_source": "guess"}, {"difference_window": 0}, {"speed_source": "observer"}):
         with pytest.raises(ParameterError, match=next(iter(bad))):
@@ -124,7 +125,7 @@ def test_an_observer_that_the_counts_contradict_gives_way_to_them() -> None:
         ({"speed_source": "measured"}, "measured"),
     ],
 )
-def test_the_speeds_source_begins_anew_where_what_shapes_it_changes(change, anew) -> None:
+def test_the_speed_source_restarts_when_its_settings_change(change, anew) -> None:
     loop = make("observer")
     rest(loop, LEARNT + 1)
     loop.configure(replace(loop.settings, **change))
@@ -185,14 +186,14 @@ def test_switching_the_delay_on_begins_its_past_at_the_present_reference() -> No
         then = loop.reference.velocity
         loop.configure(replace(loop.settings, reference_delay=after))
         loop.step(9.0, 0.0, DT)
-        # No further than the acceleration goes in the samples by which the delay is changed.
+        # At most the acceleration during the samples of the changed delay
         assert abs(loop.reference.velocity - then) <= 6 * DT
 
 
 def clipped(clip: float, samples: int = 1500) -> tuple[list[float], list[float], list[str]]:
     """Return speeds, voltages and sources of a wheel that goes to 0.7 rad/s behind a clip [V].
 
-    Gains are what the observer bears at 5 kHz; nobody knows of the clip.
+    The gains are the largest for the observer at 5 kHz; the clip is unknown to it.
     """
     ratio, dt = 65.0, 2e-4
     model = MotorModel(dc_gain=2.4, time_constant=0.032, time_constant_product=8.7e-5)

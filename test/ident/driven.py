@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Records of a motor of first order behind a driver that has one effect on its command."""
 
 import math

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A motor of its own for the tests: fixed small steps, shares nothing with the estimator."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Recordings of known motors for the tests of estimation."""
 
 from __future__ import annotations
@@ -5,8 +6,6 @@ from __future__ import annotations
 import independent
 import numpy as np
 
-from smp_motor_ident.model.physical import from_physical, physical
-from smp_motor_ident.model.structures import SecondOrder
 from smp_motor_ident.record import Hardware, Record
 
 QUANTUM = 2 * np.pi / 500
@@ -15,11 +14,20 @@ COLUMNS = ("resistance", "inductance", "motor_constant", "inertia", "viscous_fri
 
 def truth(wheel: str, static_voltage: float) -> dict[str, float]:
     """Return parameters and combinations of a motor of Table 1 with Coulomb friction."""
-    p = independent.TABLE_1[wheel]
-    coulomb = static_voltage * p[2] / p[0]
-    z = from_physical(*p, coulomb)
-    seen = SecondOrder().combinations(z)
-    return {**physical(z), **{n: value for n, (value, _) in seen.items()}}
+    r, el, k, j, b = independent.TABLE_1[wheel]
+    a0 = k * k + r * b
+    return {
+        "resistance": r,
+        "inductance": el,
+        "motor_constant": k,
+        "inertia": j,
+        "viscous_friction": b,
+        "coulomb_friction": static_voltage * k / r,
+        "dc_gain": k / a0,
+        "time_constant": (r * j + el * b) / a0,
+        "time_constant_product": el * j / a0,
+        "static_voltage": static_voltage,
+    }
 
 
 def record(

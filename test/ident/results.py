@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A result of identification as the tests of reports and documents need it."""
 
 from __future__ import annotations

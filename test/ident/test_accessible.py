@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The pages for people who see little or use no mouse: judged by axe-core in a browser."""
 
 from __future__ import annotations
@@ -123,7 +124,7 @@ def test_no_page_has_a_serious_violation_wide_or_narrow_light_or_dark(
         assert browser.complaints == []
 
 
-def test_what_a_mouse_does_with_a_chart_a_keyboard_does_too(
+def test_charts_work_with_mouse_and_keyboard(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     file = tmp_path / "page.html"

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Samples that are stamped alike count as one, and the user hears of it."""
 
 from __future__ import annotations
@@ -8,8 +9,8 @@ import motors
 import numpy as np
 import pytest
 
-from smp_motor_ident.diagnosis.stamps import merge_bunches
 from smp_motor_ident.estimate import estimate
+from smp_motor_ident.quality.stamps import merge_bunches
 from smp_motor_ident.record import Record
 
 
@@ -21,7 +22,7 @@ def bunched(size: int) -> Record:
     return replace(made, time=made.time[last] + 1e-9 * (row % size))
 
 
-def test_a_record_with_equal_stamps_on_a_beat_is_estimated_as_without_and_says_so() -> None:
+def test_equal_stamps_on_a_beat_are_repaired_with_a_finding() -> None:
     plain = estimate(motors.record("rear_left", current=False, seconds=8.0))
     found = estimate(bunched(4))
     assert "arrival_beat" in [f.code for f in found.findings]
@@ -30,7 +31,7 @@ def test_a_record_with_equal_stamps_on_a_beat_is_estimated_as_without_and_says_s
     assert found.value("time_constant") == pytest.approx(plain.value("time_constant"), rel=0.02)
 
 
-def test_samples_that_are_stamped_alike_without_a_beat_are_one_and_that_is_said() -> None:
+def test_equal_stamps_without_a_beat_are_merged_with_a_finding() -> None:
     merged = merge_bunches(bunched(4))
     assert len(merged) == pytest.approx(len(bunched(4)) / 4, abs=1)
     assert [f.severity for f in merged.findings if f.code == "stamps_equal"] == ["warning"]

@@ -1,4 +1,5 @@
-"""The page of a commissioning in a browser: what it opens with, its numbers, its widths."""
+# SPDX-License-Identifier: Apache-2.0
+"""The page of a commissioning in a browser: first view, numbers and widths."""
 
 from __future__ import annotations
 
@@ -15,7 +16,7 @@ from results import estimate
 
 from smp_motor_control import WHEELS
 from smp_motor_ident.cli.protocol import Protocol
-from smp_motor_ident.diagnosis.wheel_test import Figures
+from smp_motor_ident.commission.wheel_test import Figures
 from smp_motor_ident.report.document import identification_document
 from smp_motor_ident.result import Share, to_json
 from smp_motor_ident.tune.verification import Change, Reading
@@ -89,7 +90,7 @@ def test_page_opens_with_motors_and_gains_then_yaml_then_the_drive(
         assert rows["Systematic, of resistance, inductance"][0] == "± 3 % (current scale)"
         assert rows["Settles, designed at most ms"] == ["150"] * 4
         assert rows["Settles, driven ms"] == ["149"] * 4
-        # What is copied is the parameter file.
+        # The button copies the parameter file.
         (copied,) = shown(browser, "#gains pre")
         assert yaml.safe_load(copied) == yaml.safe_load((passed / "gains.yaml").read_text())
         # Predicted and measured lie in one chart a wheel, each with both ways.

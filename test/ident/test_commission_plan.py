@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The plan of a commissioning, before anything moves."""
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ from results import estimate as make_estimate
 from smp_motor_ident.cli import checking, commissioning, plan, steps
 from smp_motor_ident.cli.commission import main
 from smp_motor_ident.cli.processes import ProcessError
-from smp_motor_ident.diagnosis.wheel_test import Figures
+from smp_motor_ident.commission.wheel_test import Figures
 from smp_motor_ident.finding import Finding
 from smp_motor_ident.report.commissioning import GAINS
 from smp_motor_ident.report.document import identification_document
@@ -74,7 +75,7 @@ class Client:
 
 
 FIGURES = Figures(200.0, 0.001, 0, 0.0, 0.5, 1.0, 1.0, 1.0, 25.0, 0.4, 0.05, 5.0)
-STOP = Finding("reversed", "refused", "left: positive voltage makes its counts shrink", {}, "swap")
+STOP = Finding("reversed", "refused", "left: positive voltage decreases its counts", {}, "swap")
 
 
 GIVEN = "/**/left/wheel_pid:\n  ros__parameters:\n    p: 1.0\n"
@@ -152,7 +153,7 @@ def robot(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Steps:
     return Steps(tmp_path / "robot", monkeypatch)
 
 
-def test_cut_off_in_every_part_it_sends_what_it_sends_when_it_is_not(robot: Steps) -> None:
+def test_an_interrupted_commissioning_sends_the_same_commands(robot: Steps) -> None:
     given = ["--output", str(robot.folder), "--yes"]
     robot.more = plan.Recording("excitation", "further", steps.Excitation("fourier", 9.0, 5.0))
     assert main([*given, "--amplitude", "5", "--duration", "2"]) == 0
@@ -165,13 +166,13 @@ def test_cut_off_in_every_part_it_sends_what_it_sends_when_it_is_not(robot: Step
     while main([*given, "--resume"]) == 130:  # each does one part more
         runs += 1
     assert runs == 5 and robot.sent == sent
-    # What was recorded at one voltage is not mixed with another.
+    # Recordings at different voltages are not mixed.
     robot.fuel = 100
     assert main([*given, "--resume", "--amplitude", "8"]) == 0
     assert len(robot.sent) == 2 * len(sent)
 
 
-def test_what_was_cut_off_while_it_moved_moves_again_and_afterwards_does_not(
+def test_interrupted_motion_is_repeated_and_completed_motion_is_not(
     tmp_path: Path, robot: Steps
 ) -> None:
     given = ["--output", str(robot.folder), "--yes"]
@@ -280,7 +281,7 @@ def test_a_hot_winding_ends_it_before_the_next_signal_and_goes_on_when_it_is_coo
     assert robot.done.count("excite") == 4
 
 
-def test_what_ends_it_otherwise_stands_in_its_page(
+def test_the_reason_of_an_abnormal_end_is_on_the_page(
     robot: Steps, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def refuse(*_: object) -> None:
@@ -307,7 +308,7 @@ def test_a_wheel_that_turns_faster_than_its_checks_or_its_limit_ends_the_excitat
     assert asked == [3.0, 2.0]
 
 
-def test_the_time_left_follows_what_parts_of_a_kind_took() -> None:
+def test_the_remaining_time_follows_the_duration_of_similar_parts() -> None:
     now = [0.0]
     robots = [plan.Recording("excitation", name, steps.Excitation(name, 10.0, 6.0))
               for name in ("sine", "square")]  # fmt: skip
@@ -320,7 +321,7 @@ def test_the_time_left_follows_what_parts_of_a_kind_took() -> None:
         timed.add(name, kind, 10.0)
     timed.begin("a")
     now[0] = 25.0
-    assert timed.left() == 20.0  # what is overdue is over at any moment
+    assert timed.left() == 20.0  # overdue steps count as almost finished
     timed.begin("b")
     assert timed.left() == 25.0 + 10.0  # b is late as a was, c is of another kind
     now[0] = 30.0

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A commissioning that is cut off and gone on with ends with the numbers of one that is not."""
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ from smp_motor_control.excitation import SIGNALS
 from smp_motor_ident.bag import BagWriter
 from smp_motor_ident.cli import checking, commissioning, steps
 from smp_motor_ident.cli.commission import main
-from smp_motor_ident.diagnosis.wheel_test import Figures
+from smp_motor_ident.commission.wheel_test import Figures
 from smp_motor_ident.record import Record
 
 WHEEL, RATE = "rear_left", 100.0
@@ -71,7 +72,7 @@ class Robot:
 
     def record(self, robot: steps.Robot, name: str) -> None:
         self.draft = robot.folder / name
-        self.draft.mkdir()  # what is cut off leaves it
+        self.draft.mkdir()  # an interruption leaves it
 
     def excite(self, robot: steps.Robot, plan: Sequence[steps.Excitation]) -> None:
         self.use()

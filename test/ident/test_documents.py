@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Documents of results: they read back, spoilt ones are named, files appear all or none."""
 
 from __future__ import annotations
@@ -57,9 +58,7 @@ def test_a_damaged_document_is_named_with_its_reason(
 
 
 @pytest.mark.parametrize("junk", [None, True, -1, 1e308, 10**400, "x", [], {}, [[]], {"a": {}}])
-def test_whatever_stands_anywhere_in_a_document_it_is_read_or_refused_in_a_line(
-    tmp_path: Path, junk: object
-) -> None:
+def test_any_document_is_read_or_refused_in_one_line(tmp_path: Path, junk: object) -> None:
     whole = json.dumps(identification_document({"w": estimate()}))
 
     def places(node: object, way: tuple[str | int, ...] = ()) -> Iterator[tuple[str | int, ...]]:
@@ -110,7 +109,7 @@ def test_lists_of_unequal_length_are_refused(tmp_path: Path, name: str) -> None:
         read_identification(tmp_path)
 
 
-def test_what_is_no_file_is_not_waited_for(tmp_path: Path) -> None:
+def test_pipes_and_devices_are_refused_at_once(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "identification.json")
     with pytest.raises(BagError, match="is not a file"):
         read_identification(tmp_path)
@@ -144,11 +143,11 @@ def test_a_document_nested_without_end_is_refused(tmp_path: Path, text: str) -> 
             for k in range(8)
         ), "values"),
         ("x" * 1_000_001, "larger"),
-        ("front_left: 3", "no ROS parameter file"),
+        ("front_left: 3", "give a ROS parameter file"),
         ("\xff", "is not YAML"),
     ],
 )  # fmt: skip
-def test_a_parameter_file_that_is_none_is_refused_in_a_line(
+def test_an_invalid_parameter_file_is_refused_in_one_line(
     tmp_path: Path, text: str, reason: str
 ) -> None:
     path = tmp_path / "gains.yaml"
@@ -172,7 +171,7 @@ def test_files_appear_together_and_nothing_is_overwritten_without_force(tmp_path
     assert (folder / "y.yaml").read_text() == "4"
 
 
-def test_a_failure_half_way_restores_what_was_there(
+def test_a_failed_write_restores_the_old_files(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     write_together({tmp_path / "a": "old a", tmp_path / "c": "old c"})

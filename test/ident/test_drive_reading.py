@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Changes of set-point in a recorded drive: found by segment, read as the design states them."""
 
 from __future__ import annotations
@@ -11,7 +12,7 @@ import numpy as np
 import pytest
 from wheel_simulation import Timing, simulate_closed_loop
 
-from smp_motor_control.motor.file import load_motors, paper_motors
+from smp_motor_control.motor.file import find_paper_motors, load_motors
 from smp_motor_control.motor.hardware import DriveSettings
 from smp_motor_ident.bag.storage import Table
 from smp_motor_ident.cli import driving, tune
@@ -27,8 +28,8 @@ def table(time: np.ndarray, **columns: np.ndarray) -> Table:
     return Table(None, np.round(1e9 * time).astype(np.int64), columns)
 
 
-def test_a_drive_settles_when_tune_says(tmp_path: Path) -> None:
-    motors = paper_motors()
+def test_a_drive_settles_as_tune_predicts(tmp_path: Path) -> None:
+    motors = find_paper_motors()
     gains = tmp_path / "gains.yaml"
     assert tune.main([str(motors), "--output", str(gains), "--supply", "12"]) == 0
     given = driving.designed(read_estimates(motors), gains)

@@ -1,12 +1,13 @@
-"""A speed from the time between edges is used for what it is: a mean, held until the next."""
+# SPDX-License-Identifier: Apache-2.0
+"""A speed from the time between edges is treated as a mean, held until the next edge."""
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from smp_motor_ident.diagnosis.edge_timer import between_edges, held_of
 from smp_motor_ident.estimate import estimate
+from smp_motor_ident.quality.edge_timer import between_edges, held_of
 from smp_motor_ident.record import Hardware, Record
 
 GAIN, LAG, STATIC, STEP, FINE = 40.0, 0.06, 0.4, 0.005, 1e-4
@@ -36,7 +37,7 @@ def motion(volts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def timed(speed: np.ndarray, angle: np.ndarray, tick: float, count: float = COUNT) -> np.ndarray:
-    """Return what a timer of edges says at each row; nothing after a tenth of a second without."""
+    """Return an edge timer's reading at each row; zero after a tenth of a second without edge."""
     edges = np.floor(angle / count + 0.3)
     at = np.flatnonzero(np.diff(edges)) + 1
     share = np.maximum(edges[at], edges[at - 1]) - 0.3 - angle[at - 1] / count
@@ -59,7 +60,7 @@ def recorded(tick: float, per_turn: float | None) -> Record:
 
 
 @pytest.mark.parametrize("tick, per_turn", [(1e-6, None), (4e-6, 48.0)])
-def test_what_a_timer_of_edges_holds_is_no_dead_zone(tick, per_turn):
+def test_values_held_by_an_edge_timer_are_not_a_dead_zone(tick, per_turn):
     record = recorded(tick, per_turn)
     (said,) = [f for f in between_edges(record).findings if f.code == "edge_timer"]
     assert said.evidence["count"] == pytest.approx(COUNT, rel=0.25)  # by how it is held: to a row
@@ -70,7 +71,7 @@ def test_what_a_timer_of_edges_holds_is_no_dead_zone(tick, per_turn):
         assert abs(q.value - true) < 4 * q.std and q.std < 0.25 * true
 
 
-def test_a_speed_from_counts_rounded_or_held_is_none_of_a_timer():
+def test_a_rounded_or_held_speed_from_counts_is_not_edge_timed():
     volts = steps()
     speed, angle = motion(volts)
     every = round(STEP / FINE)
@@ -93,7 +94,7 @@ def test_a_speed_from_counts_rounded_or_held_is_none_of_a_timer():
     assert between_edges(counted) is counted
 
 
-def test_the_tail_of_a_filter_is_none_of_a_timer():
+def test_the_tail_of_a_filter_is_not_edge_timed():
     """Written with a few digits, it passes through all sizes, and stays at some for rows."""
     shown = 300.0 * np.exp(-np.arange(2000) / 90.0)
     tail = np.array([float(f"{w:.4g}") for w in shown])
@@ -103,7 +104,7 @@ def test_the_tail_of_a_filter_is_none_of_a_timer():
 
 
 @pytest.mark.parametrize("per_turn", [60, 150, 400])
-def test_what_a_timer_of_edges_says_of_a_motor_that_reverses_at_once_is_no_lack_of_friction(
+def test_friction_is_found_with_an_edge_timer_in_fast_reversals(
     per_turn,
 ):
     """Where it passes zero, a reading is late by up to a row or two, and nearly none elsewhere."""

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Many recordings: each by itself, kept once it is known, compared in one table."""
 
 from __future__ import annotations
@@ -70,7 +71,7 @@ def fake(path: str, settings: tuple[Any, ...]) -> list[Row]:
         log.write(Path(path).name + "\n")
     text = Path(path).read_text()
     if text == "broken":
-        return [command._row(path, failure=f"{path}: is no recording")]
+        return [command._row(path, failure=f"{path}: is not a recording")]
     killed = Path(path + ".killed")
     if text == "deadly" and not killed.exists():
         killed.touch()
@@ -97,11 +98,11 @@ def test_a_broken_bag_fails_alone_a_killed_worker_loses_nothing_and_no_work_is_d
     before = (folder / "log").read_text()
     bags[2].write_text("finer")
     assert main([*arguments, "--force"]) == 1
-    # Only what has changed since is identified anew.
+    # Only changed recordings are identified again.
     assert (folder / "log").read_text() == before + "fine.csv\n"
 
 
-def test_a_cluster_needs_dask_and_says_so(
+def test_a_cluster_without_dask_is_refused_with_advice(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     try:

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What feed-forward may take for known of dry friction, by the interval that the estimate gives."""
 
 from __future__ import annotations
@@ -19,14 +20,14 @@ def estimate(quantity: Quantity | None, **parameters: Quantity) -> Estimate:
     return Estimate("front_left", "first_order", parameters, combinations)
 
 
-def test_a_deviation_alone_stands_for_the_interval_of_the_normal_distribution() -> None:
+def test_a_standard_deviation_alone_gives_a_normal_interval() -> None:
     found = friction_of(estimate(Quantity(1.0, 0.1)), SUPPLY)
     assert (found.low, found.high) == pytest.approx((1.0 - Z95 * 0.1, 1.0 + Z95 * 0.1), abs=1e-4)
     assert found.known == found.planned == 1.0 and found.finding is None
 
 
 @pytest.mark.parametrize(("half", "known"), [(0.239, True), (0.241, False)])
-def test_known_is_what_is_known_to_a_fiftieth_of_the_supply(half: float, known: bool) -> None:
+def test_friction_is_known_to_a_fiftieth_of_the_supply(half: float, known: bool) -> None:
     found = friction_of(estimate(Quantity(1.0, 0.1, (1.0 - half, 1.0 + half))), SUPPLY)
     assert found.known == (1.0 if known else 1.0 - half)
     assert found.planned == (1.0 if known else 1.0 + half)

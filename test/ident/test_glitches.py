@@ -1,10 +1,11 @@
-"""Readings that jump away and back within a sample are left out; what a motor does is not."""
+# SPDX-License-Identifier: Apache-2.0
+"""Readings that jump away and back within a sample are left out; real motion is not."""
 
 import numpy as np
 import pytest
 
-from smp_motor_ident.diagnosis.glitches import without_glitches
 from smp_motor_ident.estimate import estimate
+from smp_motor_ident.quality.glitches import without_glitches
 from smp_motor_ident.record import Record
 
 GAIN, TAU, STEP = 25.0, 0.06, 0.01
@@ -48,7 +49,7 @@ def test_numbers_are_right_without_the_glitches_that_are_named(seed, share, size
     ids=["usual", "no noise", "noise", "a level a sample", "fast", "fast, a level a sample"],
 )
 @pytest.mark.parametrize("seed", range(5))
-def test_what_noise_and_a_fast_motor_do_is_no_glitch(seed, kind):
+def test_noise_and_fast_motion_are_not_glitches(seed, kind):
     record = recorded(seed, **kind)
     assert without_glitches(record) is record
 
@@ -63,7 +64,7 @@ def test_a_speed_in_steps_has_no_glitches(quantum):
     assert without_glitches(coarse) is coarse
 
 
-def test_a_pulse_of_voltage_that_a_fast_motor_follows_is_no_glitch():
+def test_the_response_to_a_short_pulse_is_not_a_glitch():
     voltage = np.zeros(1_000)
     voltage[50::100] = 10.0
     speed = np.concatenate([[0.0], GAIN * voltage[:-1]])
@@ -88,7 +89,7 @@ def test_a_sensor_that_is_wrong_too_often_is_left_as_it_is():
 
 
 @pytest.mark.parametrize("lost", [0, 150])
-def test_readings_that_were_lost_are_said_beside_glitches(lost):
+def test_lost_readings_are_reported_in_addition_to_glitches(lost):
     record = glitched(recorded(1), 0.005, 700.0)
     speed = record.velocity.copy()
     speed[1_000 : 1_000 + lost] = np.nan

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The tool ``identify`` as its user meets it: files, exit codes, one-line complaints."""
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ from smp_motor_ident.cli.identification import OUTPUTS
 from smp_motor_ident.cli.identify import main
 from smp_motor_ident.finding import Finding
 from smp_motor_ident.report import words
-from smp_motor_ident.result import Estimate, Quantity
+from smp_motor_ident.result import ChainRecord, Estimate, Quantity
 
 GAIN, LAG, STEP = 25.0, 0.06, 0.01
 MAP = ("--map", "time=t", "voltage=u", "velocity=w")
@@ -98,7 +99,7 @@ def test_terminal_json_and_page_state_the_same_numbers(
     page = dict(rows)
     for name in ("dc_gain", "time_constant"):
         text = page[words.label(name)]
-        # Label and number stand in one line of the terminal, nothing but space between them.
+        # Label and number are on one line of the terminal, separated by spaces only.
         assert re.search(rf"{words.label(name)} +{re.escape(text)} ", terminal)
         value, std, unit = re.fullmatch(r"([\d.]+) ± ([\d.]+) (\S+)", text).groups()  # type: ignore[union-attr]
         digit = 10.0 ** -len(value.partition(".")[2])  # of the last decimal
@@ -128,7 +129,7 @@ def test_the_terminal_shows_the_three_gravest_messages_and_all_on_request(
         "2. Warning: Warning 0. Do 0.",
         "3. Warning: Warning 1. Do 1.",
     ]
-    assert "Unreliable: every number." in said.out  # of which there is one
+    assert "Unreliable: every number." in said.out  # the only finding
     assert re.search(r"DC gain +25.00 ± 0.10 rad/s/V .*unreliable, see 1", said.out)
     assert "3 more findings: in the report, or with --verbose." in said.out
     assert said.err.startswith("identify: motor: Unreliable: every number (lag_unknown). Record")
@@ -242,10 +243,11 @@ def test_the_executable_complains_without_a_traceback(
 
 
 def found(severity: str) -> Estimate:
-    """What an estimation returns whose data show a dead zone."""
+    """Return an estimate whose data show a dead zone."""
     finding = Finding("dead_zone", severity, "a dead zone of 1 V", {}, "record a slow ramp")  # type: ignore[arg-type]
     known = {"dc_gain": Quantity(25.0, 0.1, (24.8, 25.2), "rad/s/V")}
-    return Estimate("motor", "first_order", {}, known, findings=(finding,))
+    chain = ChainRecord(("first_order", "speed"), {"ln_a0": -3.2, "ln_a1": -6.0})
+    return Estimate("motor", "first_order", {}, known, findings=(finding,), chain=chain)
 
 
 @pytest.mark.parametrize(
@@ -304,7 +306,7 @@ def test_help_loads_nothing_that_computes(tool: str) -> None:
 
 
 @pytest.mark.parametrize("node", ["record", "play"])
-def test_what_moves_messages_loads_nothing_that_computes(node: str) -> None:
+def test_nodes_for_messages_load_no_numerical_modules(node: str) -> None:
     slow = "assert not {'scipy', 'numba', 'matplotlib'} & set(sys.modules)"
     program = f"import sys\nimport smp_motor_ident.nodes.{node}\n{slow}\n"
     subprocess.run([sys.executable, "-c", program], check=True)
@@ -325,7 +327,7 @@ def test_a_real_motor_is_recovered_and_predicts_another_day(tmp_path: Path) -> N
     assert motor["fit_percent"]["validation"] >= 93.0
 
 
-def test_paths_that_are_no_utf_8_are_read_and_written(recording: Path, tmp_path: Path) -> None:
+def test_paths_that_are_not_utf_8_are_read_and_written(recording: Path, tmp_path: Path) -> None:
     name = os.fsdecode(b"log\xff\xfe")
     log, output = tmp_path / f"{name}.csv", tmp_path / name
     log.write_bytes(recording.read_bytes())

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Ctrl-C reaches a tool even when Python drops the exception."""
 
 from __future__ import annotations
@@ -35,7 +36,7 @@ def test_a_signal_inside_a_callback_that_cannot_raise_is_raised_at_the_next_look
             interruption.check()
 
 
-def test_what_was_asked_for_is_forgotten_after_the_block():
+def test_an_interruption_is_cleared_after_the_block():
     with pytest.raises(KeyboardInterrupt), interruption.interruptible():
         os.kill(os.getpid(), signal.SIGINT)
     with interruption.interruptible():
@@ -57,7 +58,7 @@ def test_earlier_handlers_are_restored():
     assert signal.getsignal(signal.SIGTERM) is before
 
 
-def test_what_must_not_be_left_half_done_is_done_before_the_interruption():
+def test_a_protected_block_is_completed_before_an_interruption():
     done: list[str] = []
 
     def work() -> None:

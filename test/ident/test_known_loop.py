@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A loop that is known gives its commands back from set-points and speeds alone."""
 
 from __future__ import annotations
@@ -43,7 +44,7 @@ def laws():
     sys.path.insert(0, str(ROOT / "benchmarks"))
     try:
         bench = importlib.import_module("exports")
-        # The laws are of the paper's gearbox and encoder; speeds of this motor's stand for theirs.
+        # The laws are for the paper's gearbox and encoder; use this motor's speeds as theirs.
         return bench.LAWS, bench.RATIO, bench.COUNTS
     finally:
         sys.path.remove(str(ROOT / "benchmarks"))
@@ -63,7 +64,7 @@ def drive(laws, name: str, seconds: float = 20.0, seed: int = 3):
     if name == "ros_arduino_bridge":  # whole ticks, and none that is 0, which stops this board
         targets = np.rint(targets * unit)
         targets[targets == 0] = 1.0
-        targets = (targets + 0.01 * np.sign(targets)) / unit  # what the law cuts to that
+        targets = (targets + 0.01 * np.sign(targets)) / unit  # the law truncates to it
     targets[:3] = 0.0
     x, before, volts = np.zeros(4), 0, np.zeros(n)
     speed = np.zeros(n)
@@ -127,22 +128,22 @@ def test_the_motor_is_identified_through_the_loop(laws, name, tmp_path):
     assert "reconstructed_voltage" in [f["code"] for f in motor["findings"]]
 
 
-def test_what_is_not_known_is_refused(laws):
+def test_unknown_commands_are_refused(laws):
     loop, numbers = FORMATS["arduino_pid"].known, given("arduino_pid")
     time, setpoints, speed, _ = drive(laws, "arduino_pid", 6.0)
     whole = record(laws, time, setpoints, speed)
-    with pytest.raises(SignalError, match="begins while the loop is at work"):
+    with pytest.raises(SignalError, match="begins while the loop is running"):
         reconstruct(whole.slice(100, 400), loop, numbers)
     with pytest.raises(SignalError, match="ran every 20 ms"):
         reconstruct(whole, loop, numbers | {"SampleTime": 20})
-    with pytest.raises(SignalError, match="supply_voltage is not known"):
+    with pytest.raises(SignalError, match="the supply is unknown"):
         reconstruct(record(laws, time, setpoints, speed, supply_voltage=None), loop, numbers)
     coarse = record(laws, time, setpoints, np.round(speed, 1), counts_per_revolution=None)
     with pytest.raises(SignalError, match=r"logged in steps of 0\.1 rad/s.*log more digits"):
         reconstruct(coarse, loop, numbers)
 
 
-def test_a_lost_sample_ends_what_is_known_of_the_loop(laws):
+def test_a_lost_sample_ends_the_known_part_of_the_loop(laws):
     time, setpoints, speed, volts = drive(laws, "arduino_pid", 6.0)
     kept = np.arange(time.size) != 300
     one = record(laws, time[kept], setpoints[kept], speed[kept])

@@ -1,4 +1,5 @@
-"""The live window: what it keeps, how it reads, and what it demands before an estimate is made."""
+# SPDX-License-Identifier: Apache-2.0
+"""The live window: its samples, its record, and its conditions for an estimate."""
 
 from __future__ import annotations
 
@@ -9,7 +10,7 @@ import numpy as np
 import pytest
 
 from smp_motor_ident.bag.window import Window
-from smp_motor_ident.estimation.live import Demands, missing
+from smp_motor_ident.live.demands import Demands, missing
 from smp_motor_ident.record import Hardware
 
 RATIO, COUNTS, STEP = 65.5, 500.0, 0.005
@@ -38,8 +39,8 @@ def filled(seconds: float, voltage: object = None, length: float = 60.0) -> Wind
     angle = np.cumsum(25 * volts) * STEP
     counts = np.floor(angle * COUNTS / (2 * np.pi)).astype(int)
     for t, v, a, c in zip(time, volts, angle, counts, strict=True):
-        wrapped = (int(c) + 2**15) % 2**16 - 2**15
-        window.add(NOW + round(1e9 * t), state(v, np.nan, 25 * v / RATIO, a / RATIO, wrapped))
+        wrap_angle = (int(c) + 2**15) % 2**16 - 2**15
+        window.add(NOW + round(1e9 * t), state(v, np.nan, 25 * v / RATIO, a / RATIO, wrap_angle))
     return window
 
 
@@ -65,7 +66,7 @@ def test_voltages_that_differ_by_a_rounding_are_one_level() -> None:
 
 
 @pytest.mark.parametrize("volts", [np.nan, np.inf, -1e308, 1e308, 1e9])
-def test_a_voltage_that_no_supply_has_is_no_sample(volts: float) -> None:
+def test_an_impossible_voltage_is_not_a_sample(volts: float) -> None:
     window = filled(20.0)
     before = len(window)
     window.add(NOW + 20 * SECOND, state(volts, np.nan, 0.0, 0.0, 0))
@@ -107,7 +108,7 @@ def test_samples_that_come_late_from_a_busy_machine_begin_no_segment() -> None:
     assert record.starts == (0,)
 
 
-def test_a_clock_that_was_set_back_begins_the_window_anew() -> None:
+def test_a_clock_that_was_set_back_clears_the_window() -> None:
     window = filled(5.0, length=3.0)
     window.add(NOW - 3600 * SECOND, state(1.0, np.nan, 0.0, 0.0, 0))
     assert len(window) == 1
@@ -134,7 +135,7 @@ def test_rich_motion_meets_every_demand() -> None:
         (10.0, 5.0, "backward 0 %"),
     ],
 )
-def test_what_is_missing_is_named(seconds: float, voltage: float | None, word: str) -> None:
+def test_missing_excitation_is_named(seconds: float, voltage: float | None, word: str) -> None:
     assert word in "; ".join(missing(filled(seconds, voltage).record(), Demands()))
 
 

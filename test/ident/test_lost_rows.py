@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Rows that a log lost: their command is bridged, as a reader of bags does."""
 
 from dataclasses import replace
@@ -5,9 +6,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from smp_motor_ident.diagnosis.stamps import bridged
 from smp_motor_ident.estimate import estimate
 from smp_motor_ident.finding import Finding
+from smp_motor_ident.quality.stamps import bridged
 from smp_motor_ident.record import Record
 
 GAIN, LAG, FRICTION, RATE = 60.0, 0.014, 1.0, 500.0
@@ -60,7 +61,7 @@ def test_a_segment_at_another_rate_lost_nothing(begin):
     assert bridged(record) is record
 
 
-def test_what_lost_nothing_or_was_bridged_before_is_left_as_it_is():
+def test_complete_or_bridged_records_are_unchanged():
     whole = ramps(0.0)
     assert bridged(whole) is whole
     noted = replace(ramps(0.1), findings=(Finding("samples_missing", "note", "by the reader"),))

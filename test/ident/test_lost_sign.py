@@ -1,4 +1,5 @@
-"""Sizes where a sign decides are named for what they are."""
+# SPDX-License-Identifier: Apache-2.0
+"""Magnitudes without a sign are detected and named."""
 
 from dataclasses import replace
 
@@ -15,21 +16,21 @@ def driven(kinds=("square", "fourier")):
 
 
 @pytest.mark.parametrize("kind", ["sine", "square", "fourier"])
-def test_a_command_without_its_sign_is_refused_and_says_so(kind):
+def test_a_command_without_its_sign_is_refused_by_name(kind):
     record = driven((kind,))
     with pytest.raises(SignalError, match="no sign; map its direction"):
         estimate(replace(record, voltage=np.abs(record.voltage)))
 
 
 @pytest.mark.parametrize("kind", ["sine", "square", "fourier"])
-def test_a_speed_without_its_sign_is_refused_and_says_so(kind):
+def test_a_speed_without_its_sign_is_refused_by_name(kind):
     record = driven((kind,))
     size = replace(record, velocity=np.abs(record.velocity), count=None)
     with pytest.raises(SignalError, match="velocity is never negative"):
         estimate(size)
 
 
-def test_one_direction_with_pulses_that_brake_is_no_lost_sign():
+def test_braking_pulses_in_one_direction_are_not_a_lost_sign():
     """A speed that is never negative because the motor never turns back has its sign."""
     rng = np.random.default_rng(1)
     runs = [(volts, n) for n in rng.integers(20, 60, 40) for volts, n in ((8.0, n), (-2.0, 8))]
@@ -43,7 +44,7 @@ def test_one_direction_with_pulses_that_brake_is_no_lost_sign():
 
 
 @pytest.mark.parametrize("speed", [True, False])
-def test_noise_of_a_motor_at_rest_is_no_way_back(speed):
+def test_noise_at_rest_is_not_backward_motion(speed):
     volts = np.repeat([0.0, 3.0, 6.0, 2.0], [1800, 40, 60, 40])
     record = motors.record("rear_left", current=False, voltage=volts, seconds=4.0)
     rng = np.random.default_rng(2)
@@ -72,7 +73,7 @@ def test_a_voltage_in_whole_volts_is_not_questioned():
 @pytest.mark.parametrize(
     ("scale", "severity"), [(1.0, None), (20.3, "warning"), (300.7, "unreliable")]
 )
-def test_thousands_of_volts_are_questioned_whatever_they_are(scale, severity):
+def test_thousands_of_volts_are_questioned(scale, severity):
     record = driven()
     found = estimate(replace(record, voltage=scale * record.voltage)).findings
     said = [f.severity for f in found if f.code == "high_voltage"]

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A motor that is driven backwards is the same motor."""
 
 from dataclasses import replace
@@ -6,10 +7,10 @@ import numpy as np
 import pytest
 
 from smp_motor_ident.estimate import estimate
-from smp_motor_ident.likelihood.experiments import speed_quantum
+from smp_motor_ident.fit.data import speed_quantum
 from smp_motor_ident.record import Record
 
-WINDOW, STEP, UNIT = 32, 1e-3, 0.12982  # samples, s, rad/s: what the log rounds to
+WINDOW, STEP, UNIT = 32, 1e-3, 0.12982  # samples, s, rounding of the log [rad/s]
 TAU, GAIN = 0.025, 17.0
 
 
@@ -37,7 +38,7 @@ def test_a_step_and_its_mirror_image_tell_the_same_motor(volts):
     for name in ("time_constant", "averaging_window"):
         # The same sums in other signs: nothing but rounding may differ.
         assert one.value(name) == pytest.approx(other.value(name), rel=1e-6)
-    # Against the truth: a lag that is left beside the window takes up to 3 ms from either.
+    # A remaining lag takes up to 3 ms from the window.
     assert one.value("averaging_window") == pytest.approx(WINDOW * STEP, abs=0.004)
     assert one.value("time_constant") == pytest.approx(TAU, abs=0.003)
 

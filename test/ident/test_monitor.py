@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The monitor of a commissioned motor, on signals of a simulator of this file's own."""
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ import pytest
 from scipy.linalg import expm
 
 from smp_motor_ident.errors import BagError, ParameterError
-from smp_motor_ident.estimation.monitor import Commissioned, Monitor, commissioned_of
+from smp_motor_ident.live.monitor import Commissioned, Monitor, commissioned_of
 from smp_motor_ident.report import history
 from smp_motor_ident.result import Estimate
 
@@ -106,7 +107,7 @@ def followed(
 
 
 def codes(monitor: Monitor) -> set[str]:
-    """What is warned of."""
+    """Return the codes of the warnings."""
     return {f.code for f in monitor.findings()}
 
 
@@ -175,7 +176,7 @@ def test_signals_that_contradict_each_other_are_invalid_and_not_an_alarm() -> No
     assert not monitor.findings()
 
 
-def test_a_motor_that_is_none_is_refused_by_name() -> None:
+def test_invalid_commissioned_values_are_refused_by_name() -> None:
     with pytest.raises(ParameterError, match="inertia"):
         replace(MOTOR, inertia=0.0)
 

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Records without any noise, as a simulator writes them, are a motor's like others."""
 
 import numpy as np
@@ -5,7 +6,7 @@ import pytest
 from independent import excitation, simulate
 
 from smp_motor_ident.estimate import estimate
-from smp_motor_ident.likelihood.experiments import angle_quantum
+from smp_motor_ident.quality.resolution import angle_quantum
 from smp_motor_ident.record import Hardware, Record
 
 R, L, K, J, B, TC = 1.9, 4.0e-4, 0.0357, 2.2e-5, 0.0, 1.2e-2
@@ -46,7 +47,7 @@ def test_a_record_without_noise_is_answered_as_one_with_little(kind, signal, cur
         if q.value is None or q.std is None:
             assert not current or name == "static_voltage"
             continue
-        # 5 standard deviations: what is wrong silently; the simulator's steps cost 1e-4.
+        # 5 standard deviations count as a silent error; the simulator's steps cost 1e-4.
         assert abs(q.value - true) < max(5 * q.std, 1e-3 * true), name
 
 
@@ -78,7 +79,7 @@ def test_a_log_of_seven_digits_leaves_the_steps_of_its_angle(decimals):
     assert angle_quantum(turned + 0.3 * step * rng.standard_normal(t.size)) == 0.0
 
 
-def test_a_smooth_angle_comes_in_no_steps():
+def test_a_smooth_angle_has_no_steps():
     rng = np.random.default_rng(0)
     t = np.arange(5000) / 200
     for _ in range(50):

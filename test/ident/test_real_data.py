@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Real motors' recordings, as published (see their README for source and licence)."""
 
 from pathlib import Path
@@ -29,7 +30,7 @@ def step(path: Path) -> Record:
 )
 def test_prbs_of_one_day_explains_the_other_day(fitted, kept):
     result = estimate(prbs(fitted), validation=[prbs(kept)])
-    # The owner's static curve; 3 % and the range of tau are what the data's README knows.
+    # The owner's static curve; 3 % and the range of tau are from the data's README.
     assert np.degrees(result.value("dc_gain")) == pytest.approx(159.9, rel=0.03)
     assert 0.030 < result.value("time_constant") < 0.042
     assert result.fit_percent.validation > 94

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A Record refuses what cannot be one motor's signals, and names it."""
 
 from __future__ import annotations
@@ -48,7 +49,7 @@ def test_contradictory_signals_are_refused_by_name(changes, named):
 
 
 @pytest.mark.parametrize("name", ["current", "velocity", "position"])
-def test_an_infinite_measurement_is_none(name):
+def test_an_infinite_measurement_counts_as_missing(name):
     # Firmware that divides by the time between pulses sends them.
     measured = np.array([0.0, 1.0, np.inf, -np.inf, np.nan, 5.0])
     record = a_record(**{"velocity": np.ones(6), name: measured})

@@ -1,4 +1,5 @@
-"""The report as its reader meets it: how long it is, in which order, and what is seen at once."""
+# SPDX-License-Identifier: Apache-2.0
+"""Layout of the report: its length, its order and its first view."""
 
 from __future__ import annotations
 
@@ -37,7 +38,8 @@ def poor(wheel: str) -> Estimate:
     }
     warnings = [Finding(f"w{k}", "warning", f"{k}: {LONG}", advice=LONG) for k in range(4)]
     notes = [Finding(f"n{k}", "note", f"{k}: {LONG}") for k in range(3)]
-    grave = Finding("lag_unknown", "unreliable", "the data do not tell time_constant", advice=LONG)
+    grave = Finding("lag_unknown", "unreliable", "the data do not tell it", advice=LONG,
+                    quantities=("time_constant",))  # fmt: skip
     return replace(
         known, combinations=told, parameters=physical, findings=(*notes, *warnings, grave)
     )
@@ -86,7 +88,7 @@ def test_four_wheels_full_of_warnings_are_short_and_never_scroll_sideways(
     browser: Browser, file: Path, width: int, highest: int, dark: bool
 ) -> None:
     browser.open(file, width, dark=dark)
-    # A phone of 390 px shows a third of what 1280 px show: its limit is what that makes of 5,000.
+    # A phone of 390 px shows a third of 1280 px, so the limit of 5,000 is scaled.
     assert browser.value("document.documentElement.scrollHeight") <= highest
     for _ in range(2):  # as it opens, and with everything unfolded
         assert browser.value("document.documentElement.scrollWidth") <= width
@@ -126,7 +128,7 @@ def row(browser: Browser, name: str) -> list[str]:
     return cells
 
 
-def test_the_card_says_which_number_is_unreliable_and_names_what_no_recording_shows(
+def test_the_card_names_unreliable_values_and_systematic_errors(
     browser: Browser, file: Path
 ) -> None:
     browser.open(file, 1280)
@@ -174,7 +176,7 @@ def test_the_picture_begins_where_single_answers_are_seen_and_shows_all_on_reque
     browser.open(path, 1280)
     shown = "document.querySelector('.live').dataset.shown"
     begin, end = map(float, browser.value(shown).split())
-    # Eighty lags of 40 ms, out of what was held out.
+    # Eighty lags of 40 ms of the held-out data
     assert end - begin == pytest.approx(3.2, abs=0.1)
     assert begin > 26.9 and end <= 40.0
     browser.value("document.querySelector('button[data-key=\"0\"]').click()")

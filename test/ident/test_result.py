@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """An Estimate survives its file, and its draws follow its covariance."""
 
 from __future__ import annotations

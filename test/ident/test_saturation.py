@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A current that a driver regulates rests at its command; a clipped sensor rests at its limit."""
 
 from dataclasses import replace
@@ -6,9 +7,9 @@ import motors
 import numpy as np
 import pytest
 
-from smp_motor_ident.diagnosis.data_quality import screen
 from smp_motor_ident.errors import SignalError
 from smp_motor_ident.estimate import estimate
+from smp_motor_ident.quality.screen import screen
 from smp_motor_ident.record import Record
 
 RATE, RESISTANCE, CONSTANT = 200.0, 2.0, 0.03
@@ -16,7 +17,7 @@ INERTIA, VISCOUS, COULOMB = 4e-5, 2e-5, 2e-3
 
 
 def regulated() -> Record:
-    """Return a motor of which a driver regulates the current, with the voltage that this takes."""
+    """Return a record of a motor whose driver regulates the current."""
     fine, steps = 20, 2000
     levels = np.random.default_rng(3).uniform(-1.0, 1.0, 40)
     asked = np.repeat(np.clip(levels, -0.5, 0.5), 50)
@@ -39,7 +40,7 @@ def regulated() -> Record:
                   hardware=motors.record(seconds=1.0).hardware)  # fmt: skip
 
 
-def test_a_current_that_a_driver_regulates_is_no_clipped_one():
+def test_a_regulated_current_is_not_clipped():
     record = regulated()
     assert (record.current == record.current.max()).mean() > 0.1
     found = estimate(record)
@@ -49,7 +50,7 @@ def test_a_current_that_a_driver_regulates_is_no_clipped_one():
         assert found.value(name) == pytest.approx(true, rel=0.02)  # a fiftieth costs a loop nothing
 
 
-def test_a_current_that_is_clipped_is_none_that_a_driver_regulates():
+def test_a_clipped_current_is_not_regulated():
     good = motors.record("rear_left", seconds=4.0)
     with pytest.raises(SignalError, match="saturated sensor, current"):
         screen([replace(good, current=np.clip(good.current, -0.8, 0.8))])

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A reversed answer is separated from a late one; where nothing separates them, it says so."""
 
 from dataclasses import replace
@@ -6,9 +7,9 @@ import motors
 import numpy as np
 import pytest
 
-from smp_motor_ident.diagnosis.data_quality import _signs
-from smp_motor_ident.diagnosis.signs import likeness
 from smp_motor_ident.errors import InsufficientExcitationError, SignalError
+from smp_motor_ident.quality.screen import _signs
+from smp_motor_ident.quality.signs import likeness
 
 GOOD = motors.record("rear_left", seconds=4.0)
 N = len(GOOD)
@@ -56,7 +57,7 @@ def test_a_current_of_the_wrong_sign_is_found_and_the_right_one_left_alone():
 
 
 def test_a_current_between_rows_that_were_left_out_shows_no_sign():
-    """Of a command switched every eight rows, of which every fifth is kept: it is older by then."""
+    """The command switches every eight rows and every fifth row is kept, so the current lags."""
     bits = np.random.default_rng(1).choice([-10.0, 10.0], 375)
     whole = motors.record("rear_left", voltage=np.repeat(bits, 8), rate=200.0)
     kept = np.arange(0, 2990, 5)
@@ -68,7 +69,7 @@ def test_a_current_between_rows_that_were_left_out_shows_no_sign():
 
 @pytest.mark.parametrize("sign", [1, -1])
 @pytest.mark.parametrize("samples", [2.9, 3.0, 3.1])
-def test_three_samples_to_a_period_tell_no_sign(samples, sign):
+def test_three_samples_per_period_do_not_determine_the_sign(samples, sign):
     """Lag, sampling and a driver's clock may come to any phase there: no wrong cause is named."""
     record = sine(samples) if sign > 0 else swapped(sine(samples))
     found = likeness([record], [record.velocity], lags=True)
@@ -78,8 +79,8 @@ def test_three_samples_to_a_period_tell_no_sign(samples, sign):
         _signs([record], "record")
 
 
-def test_a_motor_that_stands_has_no_swapped_sign():
-    """What a noisy sensor says of a standing motor has no sign, however it falls out."""
+def test_a_motor_at_rest_has_no_swapped_sign():
+    """The noise of a sensor at standstill has no sign, whatever its correlation."""
     for seed in range(12):
         rng = np.random.default_rng(seed)
         slow = np.cumsum(rng.standard_normal(N))  # drifts as a command does

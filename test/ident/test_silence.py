@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A sensor that falls silent is dead where the voltage would have moved it, and only there."""
 
 from dataclasses import replace
@@ -6,9 +7,9 @@ import motors
 import numpy as np
 import pytest
 
-from smp_motor_ident.diagnosis.silence import silent
 from smp_motor_ident.errors import SignalError
 from smp_motor_ident.estimate import estimate
+from smp_motor_ident.quality.silence import silent
 
 RATE = 2000.0
 TIME = np.arange(int(10 * RATE)) / RATE
@@ -58,7 +59,7 @@ def test_an_encoder_whose_cable_comes_off_half_way_is_dead(signal, kind):
 
 
 @pytest.mark.parametrize("signal", ["count", "velocity"])
-def test_a_speed_below_the_step_of_its_sensor_is_no_dead_one(signal):
+def test_a_speed_below_the_step_of_its_sensor_is_not_a_dead_sensor(signal):
     """A speed in whole steps of 60 rad/s, or the counts of the same motor, in ever faster turns."""
     record = coarse(signal)
     speed = np.gradient(motors.record("rear_left", voltage=CHIRP, rate=RATE).count * 0.01257, TIME)
@@ -69,14 +70,14 @@ def test_a_speed_below_the_step_of_its_sensor_is_no_dead_one(signal):
 
 
 @pytest.mark.parametrize("wheel", ["front_left", "front_right", "rear_left", "rear_right"])
-def test_a_motor_that_its_friction_stops_in_a_fast_chirp_has_no_dead_encoder(wheel):
+def test_a_motor_stopped_by_friction_in_a_fast_chirp_is_not_a_dead_encoder(wheel):
     volts = 10.0 * np.sin(2 * np.pi * (0.3 * TIME + 5.0 * TIME**2))
     stops = motors.record(wheel, current=False, voltage=volts, rate=RATE, static_voltage=2.0)
     assert np.ptp(stops.count[int(0.8 * len(stops)) :]) == 0
     silent(replace(stops, velocity=None), "record")
 
 
-def test_what_stands_at_the_end_of_one_run_says_nothing_of_the_next():
+def test_a_standstill_at_the_end_of_a_run_does_not_affect_the_next():
     volts = motors.independent.excitation(np.arange(2000) / 200.0, "sine", 10.0)
     whole = coarse("count", volts, 200.0)
     stands = (np.arange(2000) >= 850) & (np.arange(2000) < 1150)

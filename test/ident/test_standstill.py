@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A standing encoder repeats one error; taken for news it would make intervals too narrow."""
 
 from __future__ import annotations
@@ -7,7 +8,8 @@ import pytest
 
 from smp_motor_ident.errors import InsufficientExcitationError
 from smp_motor_ident.estimate import estimate
-from smp_motor_ident.likelihood.experiments import REST, prepare
+from smp_motor_ident.fit.data import prepare
+from smp_motor_ident.quality.resolution import REST
 from smp_motor_ident.record import Hardware, Record
 
 
@@ -20,10 +22,10 @@ def counted(counts: list[int], starts: tuple[int, ...] = (0,)) -> Record:
 
 def kept(record: Record) -> list[int]:
     """Indices at which the angle is an output."""
-    return [int(k) for k in np.flatnonzero(np.isfinite(prepare([record], False).output))]
+    return [int(k) for k in np.flatnonzero(np.isfinite(prepare([record], False).motion))]
 
 
-def test_of_a_standstill_the_middle_stays() -> None:
+def test_the_middle_sample_of_a_standstill_is_kept() -> None:
     moving, still = list(range(20)), [20] * 31
     assert kept(counted([*moving, *still, *range(21, 30)])) == [*range(20), 35, *range(51, 60)]
 
@@ -33,7 +35,7 @@ def test_a_segment_that_begins_at_rest_keeps_its_first_sample() -> None:
     assert kept(counted(counts, (0, 40))) == [0, *range(30, 40), 40, *range(70, 74)]
 
 
-def test_slow_motion_is_left_as_it_is() -> None:
+def test_slow_motion_is_unchanged() -> None:
     slow = [k // (REST - 1) for k in range(90)]
     assert kept(counted(slow)) == list(range(90))
 
@@ -43,7 +45,7 @@ def test_how_long_it_stands_adds_nothing(rest: int) -> None:
     assert len(kept(counted([0, 1, 2, *[3] * rest, 4, 5]))) == 6
 
 
-def test_a_motor_that_stands_under_a_noisy_angle_is_refused_whatever_its_current_tells() -> None:
+def test_a_motor_at_rest_with_a_noisy_angle_is_refused_despite_its_current() -> None:
     resistance, inductance, step = 4.0, 0.02, 0.01
     rng = np.random.default_rng(3)
     voltage = np.repeat(rng.choice([-0.1, 0.0, 0.1], 40), 15)
@@ -58,5 +60,5 @@ def test_a_motor_that_stands_under_a_noisy_angle_is_refused_whatever_its_current
         position=1e-3 * rng.standard_normal(voltage.size),
         current=current + 1e-4 * rng.standard_normal(voltage.size),
     )
-    with pytest.raises(InsufficientExcitationError, match="the motor stands"):
+    with pytest.raises(InsufficientExcitationError, match="the motor is at rest"):
         estimate(record)

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Gains for a speed that is made of an angle with noise of its own, with counts and without."""
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ DECAY = math.exp(-T / TAU)
 
 @pytest.fixture(scope="module")
 def record() -> Record:
-    """A motor driven by random steps, of which only a noisy angle is known."""
+    """Return a record of a motor driven by random steps, with only a noisy angle."""
     rng = np.random.default_rng(11)
     n = 8000
     voltage = np.repeat(rng.uniform(-10.0, 10.0, n // 100), 100)
@@ -91,7 +92,7 @@ def test_noise_of_an_angle_limits_the_gains(found):
     assert speeds.mean() == pytest.approx(0.5 * GAIN * SUPPLY, rel=0.01)
 
 
-def test_an_angle_without_noise_to_speak_of_allows_what_it_did(found):
+def test_an_angle_with_negligible_noise_gives_the_same_gains(found):
     quiet = loop_of(found, "--angle-noise", "1e-9")
     assert quiet.angle_noise == 1e-9
     one, none = design(found, quiet), design(found, replace(quiet, angle_noise=0.0))
@@ -116,13 +117,13 @@ def test_simulated_noise_of_an_angle_is_that_of_the_density(found, source, windo
     assert run.voltage.std() == pytest.approx(problem.control_noise(feedback), rel=0.05)
 
 
-def test_the_choice_tells_what_a_longer_difference_would_allow(found):
+def test_the_choice_reports_the_gains_of_a_longer_difference(found):
     loop, why = choose_source(found, loop_of(found))
     assert loop == loop_of(found)
-    assert "difference over 1 of the loop's samples" in why and "--difference-window 8" in why
+    assert "difference over 1 samples of the loop" in why and "--difference-window 8" in why
     longer = loop_of(found, "--difference-window", "8")
     assert longer.averaging_given
-    # Within the same control noise: what is not asked for may make more of it.
+    # Within the same control noise; without this limit the default may allow more.
     strict = (replace(one, noise_voltage=one.noise_limit) for one in (loop, longer))
     short, long = (design(found, one, samples=200) for one in strict)
     assert long.gains.i > 8 * short.gains.i

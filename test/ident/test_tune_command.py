@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The command ``tune``: files, exit codes, one-line refusals."""
 
 from __future__ import annotations
@@ -46,7 +47,7 @@ def identified(tmp_path) -> Path:
     return tmp_path
 
 
-def test_parameter_file_holds_what_the_four_nodes_take(identified, capsys):
+def test_the_parameter_file_is_accepted_by_the_four_nodes(identified, capsys):
     output = identified / "gains.yaml"
     assert main([str(identified), "--output", str(output)]) == 0
     tree = yaml.safe_load(output.read_text())
@@ -69,7 +70,7 @@ def test_parameter_file_holds_what_the_four_nodes_take(identified, capsys):
     assert "one set of gains for all" in capsys.readouterr().out
 
 
-def test_motor_file_of_identify_is_taken_as_it_is(tmp_path, capsys):
+def test_a_motor_file_of_identify_is_accepted(tmp_path, capsys):
     output = tmp_path / "gains.yaml"
     assert main([str(MOTORS), "--output", str(output), "--rate", "100", "--method", "simc"]) == 0
     assert "SIMC" in output.read_text()
@@ -84,7 +85,7 @@ def test_comparison_lists_every_method_and_recommends_one(identified, capsys):
     assert "* recommended: " in words_shown
 
 
-def test_every_step_says_how_long_it_will_take(identified, monkeypatch):
+def test_every_step_is_announced_with_its_duration(identified, monkeypatch):
     told: list[str] = []
 
     @contextlib.contextmanager

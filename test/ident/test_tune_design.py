@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """design, compare and the wheels together: units, robustness, refusals."""
 
 from __future__ import annotations
@@ -138,7 +139,7 @@ def test_delay_of_the_estimate_counts_like_delay_of_the_loop():
         ({"phase_margin": math.nan}, "phase_margin is nan"),
         ({"maximum_sensitivity": 0.9}, "maximum_sensitivity is 0.9"),
         ({"focus": "sport"}, "focus is 'sport'"),
-        ({"gain": 1.0}, "knows no target 'gain'"),
+        ({"gain": 1.0}, "has no target 'gain'"),
         ({"bandwidth": 1e-6}, "bandwidth 1e-06 rad/s cannot keep"),
         ({"bandwidth": "fast"}, "bandwidth is 'fast'; it must be a finite number"),
         ({"maximum_sensitivity": 1.01}, "the nearest that holds has Ms 1.05"),
@@ -157,25 +158,25 @@ def test_impossible_demand_is_refused_with_the_limit(targets, words):
 @pytest.mark.parametrize(
     ("loop", "words"),
     [
-        (Loop(sample_time=1e-5, delay=0.5), "sample at 600 Hz or less"),
+        (Loop(sample_time=1e-5, delay=0.5), "Sample at 600 Hz or less"),
         (Loop(difference_window=1000), "average over fewer samples"),
         (
             Loop(supply_voltage=1e-3),
-            "the nearest that holds has a control_noise of|nothing near it",
+            "the nearest that holds has a control_noise of|no similar design",
         ),
     ],
 )
-def test_impossible_loop_is_refused_with_what_to_do(loop, words):
+def test_an_impossible_loop_is_refused_with_advice(loop, words):
     with pytest.raises(DesignError, match=words):
         design(estimate(), loop)
 
 
-def test_a_low_phase_margin_is_no_reason_to_refuse():
+def test_a_low_phase_margin_is_accepted():
     # Ms 1.4 leaves 42 deg in any case.
     assert design(estimate(), Loop(), phase_margin=1.0).margins.phase > 41.0
 
 
-def test_nearest_acceleration_that_the_refusal_tells_is_accepted():
+def test_the_acceleration_named_in_a_refusal_is_accepted():
     with pytest.raises(DesignError) as refusal:
         design(estimate(), Loop(), max_acceleration=1e5)
     words = str(refusal.value).split()
@@ -191,7 +192,7 @@ def test_motor_that_friction_holds_is_refused():
 
 def test_estimate_without_dynamics_is_refused():
     bare = Estimate("rear_left", "static_gain", {}, {"dc_gain": Quantity(25.0)})
-    with pytest.raises(DesignError, match="rear_left: the estimate holds neither"):
+    with pytest.raises(DesignError, match="rear_left: the estimate has neither"):
         design(bare, Loop())
 
 
@@ -275,7 +276,7 @@ def test_one_set_for_motors_that_differ_holds_for_all_of_them():
         assert one.robustness.holds >= 0.99
 
 
-def test_wheels_together_share_what_the_weakest_can_do_and_alone_do_not():
+def test_wheels_together_share_the_limits_of_the_weakest():
     found = {f"wheel_{k}": replace(estimate(k), wheel=f"wheel_{k}") for k in range(4)}
     loops = dict.fromkeys(found, Loop())
     together = design_wheels(found, loops)
@@ -285,8 +286,8 @@ def test_wheels_together_share_what_the_weakest_can_do_and_alone_do_not():
     assert len({d.reference.drive.top_speed for d in alone.designs.values()}) == 4
     for wheel, one in together.designs.items():
         assert one.reference.drive.top_speed <= alone.designs[wheel].reference.drive.top_speed
-        # Each motor stays within its own 95 % of 12 V along the common change, to what the
-        # instants at which it was looked at may miss.
+        # Each motor stays within its own 95 % of 12 V along the common change, apart from peaks
+        # between the evaluated instants.
         motor, profile = combinations(TABLE_1[int(wheel[-1])]), one.reference.profile()
         profile.set_target(0.9 * one.reference.max_velocity, 0.005)
         seen = [profile.ahead(k * 1e-4) for k in range(int(profile.duration / 1e-4))]

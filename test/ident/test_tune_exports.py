@@ -1,4 +1,5 @@
-"""Exported gains do in the target's own arithmetic what is said of them."""
+# SPDX-License-Identifier: Apache-2.0
+"""Exported gains keep their stated properties in the target's own arithmetic."""
 
 from __future__ import annotations
 
@@ -46,7 +47,9 @@ def test_the_targets_own_arithmetic_settles_and_overshoots_as_specified(bench, n
 
 
 @pytest.mark.parametrize("name", FORMATS)
-def test_the_command_writes_what_the_target_takes_and_says_what_it_lacks(name, tmp_path, capsys):
+def test_the_command_writes_the_targets_parameters_and_names_its_limitations(
+    name, tmp_path, capsys
+):
     output = tmp_path / "gains.txt"
     assert main([str(MOTORS), "--export", name, "--output", str(output)]) == 0
     text = output.read_text()

@@ -1,4 +1,5 @@
-"""Every tuning method: its published numbers, and what it specifies on the sampled loop."""
+# SPDX-License-Identifier: Apache-2.0
+"""Every tuning method: its published numbers, and its specification on the sampled loop."""
 
 from __future__ import annotations
 
@@ -104,23 +105,23 @@ def test_relay_feedback_finds_the_ultimate_point_without_a_model(coefficients):
     quantum = one.loop.count_angle / one.loop.sample_time
     voltage, speed = oscillate(one, 3.0, quantum, 4.0)
     gain, period = read_oscillation([(voltage, speed)], one.loop.sample_time)
-    # What was read is a point of the loop's own response; counts of a tenth of the amplitude
-    # leave less than 1 %.
+    # The result is a point of the loop's own response; counts of a tenth of the amplitude cause
+    # an error below 1 %.
     w = 2 * np.pi / period
     response = one.plant.response(np.array([w]))[0, 0]
     assert gain * abs(response) == pytest.approx(1.0, rel=0.02)
-    # And the one at which a relay oscillates: short of half a turn by what the hysteresis takes
-    # (Astrom and Hagglund 1984, equation 5), to the one sample within which it cannot switch.
+    # A relay oscillates where the phase is short of half a turn by the effect of the hysteresis
+    # (Astrom and Hagglund 1984, equation 5), to the resolution of one sample.
     short = np.arcsin(min(quantum * gain * np.pi / (4 * 3.0), 1.0))
     assert abs(np.angle(-response) - short) <= w * one.loop.sample_time
     assert np.abs(voltage).max() == 3.0
 
 
-def test_relay_feedback_bears_lost_samples():
+def test_relay_feedback_tolerates_lost_samples():
     one = problem(PAPER[3])
     voltage, speed = oscillate(one, 3.0, one.loop.count_angle / 0.005, 4.0)
     time = 0.005 * np.arange(voltage.size)
-    acted = np.roll(voltage, 2)  # what the hardware reports: a sample of delay, one of holding
+    acted = np.roll(voltage, 2)  # reported voltage: one sample of delay, one of holding
     kept = np.random.default_rng(4).uniform(size=time.size) > 0.05
     answer = {
         "time": time[kept].tolist(),
@@ -138,7 +139,7 @@ def test_relay_feedback_bears_lost_samples():
     assert asked == pytest.approx(whole, rel=0.05)
 
 
-def test_relay_is_read_between_the_moments_at_which_its_computer_stands_still():
+def test_relay_is_evaluated_between_pauses_of_its_computer():
     one = problem(PAPER[3])
     voltage, speed = oscillate(one, 3.0, one.loop.count_angle / 0.005, 4.0)
     period = read_oscillation([(voltage, speed)], 0.005)[1]
@@ -180,7 +181,9 @@ def test_margin_method_keeps_margin_sensitivity_and_ripple(coefficients, sample_
 
 @pytest.mark.parametrize("coefficients", PAPER)
 @pytest.mark.parametrize("sample_time", [0.01, 0.005, 0.002, 0.001])
-def test_margin_method_is_no_softer_than_simc_at_the_same_sensitivity(coefficients, sample_time):
+def test_margin_method_rejects_loads_as_well_as_simc_at_the_same_sensitivity(
+    coefficients, sample_time
+):
     one = problem(coefficients, sample_time)
     feedback = METHODS["margin"].solve(one)
     peak = loop_margins(one.plant, feedback).sensitivity
@@ -226,7 +229,7 @@ def test_a_noisy_speed_does_not_leave_a_load_to_itself():
     assert shaking(strict, found) <= 1.2**8
 
 
-def test_a_wheel_is_shaken_no_more_than_usual_where_gains_are_no_softer_than_simc():
+def test_speed_noise_stays_at_its_default_limit_if_gains_match_simc():
     one = problem((1 / 34.0, 0.01 / 34.0, 0.019 * 0.01**2 / 34.0), 0.01)
     one = Problem(one.plant, replace(one.loop, counts_per_revolution=24.0))
     assert shaking(one, METHODS["margin"].solve(one)) <= 1.0

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Designed gains on the loop that runs: the wheel's own controller on the simulated hardware."""
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ from smp_motor_control.fields import settings_of as settings_of_parameters
 from smp_motor_control.motor.file import load_motors
 from smp_motor_control.motor.hardware import DrivenMotor, DriveSettings
 from smp_motor_control.motor.model import MotorModel
-from smp_motor_control.parameter_file import flat
+from smp_motor_control.parameter_file import flatten
 from smp_motor_control.reference.profile import ProfileLimits, Reference
 from smp_motor_control.reference.time_optimal import VoltageLimited
 from smp_motor_control.wheel.controller import State, WheelController, WheelSettings
@@ -31,7 +32,7 @@ from smp_motor_ident.tune.writing import parameters, silence, slow_loop
 
 MOTORS = Path(__file__).resolve().parents[2] / "config" / "motors_paper.yaml"
 STEP = 1.2
-"""Set-point [rad/s, wheel]: about half of what the slowest motor reaches."""
+"""Set-point [rad/s, wheel]: about half of the slowest motor's top speed."""
 
 
 def settings_of(one) -> LoopSettings:
@@ -56,7 +57,7 @@ def estimates():
 
 @pytest.mark.parametrize("share", [0.05, 0.9])
 @pytest.mark.parametrize(("T", "static"), [(0.005, 0.0), (0.005, 0.5), (2e-4, 0.5)])
-def test_wheel_loop_feeds_forward_what_the_design_planned(estimates, share, T, static):
+def test_the_wheel_loop_applies_the_designed_feed_forward(estimates, share, T, static):
     one = design(estimates["front_left"], Loop(sample_time=T))
     settings = settings_of(one)
     loop = WheelLoop(replace(settings, gains=replace(settings.gains, feedforward_static=static)))
@@ -133,7 +134,7 @@ def test_four_wheels_arrive_together_without_overshoot(estimates, rate):
         assert speed.max() < 1.02 * STEP
         outside = np.flatnonzero(np.abs(speed - STEP) > 0.02 * STEP)
         times.append(run.time[outside[-1] + 1])
-    # One control period, 5 ms at 1 kHz: what the wheels together are held to.
+    # One control period, 5 ms at 1 kHz: the requirement on simultaneous arrival
     assert max(times) - min(times) <= max(T, 0.005) + 1e-9
 
 
@@ -158,7 +159,7 @@ def test_a_reversal_turns_the_friction_voltage_in_time(estimates):
 def test_gains_for_a_slow_loop_drive_its_wheel(estimates, rate):
     T, entry = 1 / rate, load_motors(MOTORS)["front_left"]
     one = design(estimates["front_left"], Loop(sample_time=T))
-    written = flat(parameters(one))
+    written = flatten(parameters(one))
     values = {name: field.default for name, field in parameters_in(WheelSettings).items()}
     settings = settings_of_parameters(WheelSettings, {**values, **written})
     wheel = WheelController(WheelSettings())

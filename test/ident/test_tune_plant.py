@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The sampled motor, its margins and its simulation, against simulators that share no code."""
 
 from __future__ import annotations
@@ -91,12 +92,12 @@ def test_closed_loop_matrix_and_simulation_agree_on_the_decay(window):
     eigenvalues = np.linalg.eigvals(closed_loop(plant, feedback)[0])
     run = simulate(plant, Controller(feedback), Inputs(np.ones(400)))
     left = np.abs(run.speed[0] - 1)
-    # The slowest mode alone is left after 100 samples; 3 % for what the others still add.
+    # Only the slowest mode remains after 100 samples; 3 % for the rest of the others.
     slope = (left[360:].max() / left[100:140].max()) ** (1 / 260)
     assert slope == pytest.approx(np.abs(eigenvalues).max(), rel=0.03)
 
 
-def test_simulated_controller_is_the_running_one():
+def test_the_simulated_controller_equals_the_running_one():
     """The batch simulation against Pid itself, saturation and anti-windup included."""
     T, limit = 0.005, 4.5
     plant = sample(motors(*MOTOR_1), Loop(sample_time=T, delay=T))
@@ -211,7 +212,7 @@ def test_delay_margin_counts_the_lag_to_the_next_turn_where_the_phase_is_beyond_
         assert (spectral_radius(sample(resonant, later), feedback)[0] < 1) == stable
 
 
-def test_batch_of_motors_is_the_motors_one_by_one():
+def test_a_batch_of_motors_equals_single_motors():
     rng = np.random.default_rng(2)
     a0, a1, a2 = (x * rng.uniform(0.5, 2, 20) for x in MOTOR_1)
     delay = rng.uniform(0, 0.02, 20)
@@ -226,7 +227,7 @@ def test_batch_of_motors_is_the_motors_one_by_one():
     np.testing.assert_allclose(batch, single, rtol=1e-6)
 
 
-def test_very_small_inductance_is_the_first_order_motor():
+def test_very_small_inductance_gives_the_first_order_motor():
     loop = Loop(sample_time=0.01)
     omega = np.array([1.0, 10.0, 100.0])
     tiny = sample(motors(0.04, 0.002, 0.002 * 1e-7), loop).response(omega)

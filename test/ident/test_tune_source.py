@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The observer in the loop, and the choice of where the speed comes from."""
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ from smp_motor_ident.cli.tune import main
 from smp_motor_ident.cli.tuning import read_estimates
 from smp_motor_ident.errors import DesignError
 from smp_motor_ident.finding import Finding
+from smp_motor_ident.result import ChainRecord
 from smp_motor_ident.tune import Loop, design
 from smp_motor_ident.tune.feedback import spectral_radius
 from smp_motor_ident.tune.motors import Motors, motors_of
@@ -102,7 +104,7 @@ def test_gain_margin_holds_on_the_running_loop_with_its_observer(estimates, rate
     assert late_ripple(1.1 * margin) > 10.0
 
 
-def test_at_1_khz_the_observer_is_taken_and_said_why(estimates):
+def test_at_1_khz_the_observer_is_chosen_with_its_reason(estimates):
     loop, why = choose_source(estimates["rear_left"], Loop(sample_time=0.001))
     assert loop.speed_source == "observer"
     assert "the reported speed allows i = " in why
@@ -112,14 +114,14 @@ def test_at_1_khz_the_observer_is_taken_and_said_why(estimates):
     assert better.performance.control_noise <= 1.01 * 0.48
 
 
-def test_a_model_whose_error_shows_what_it_lacks_is_not_leaned_on(estimates):
+def test_the_observer_is_not_chosen_for_an_inadequate_model(estimates):
     shown = Finding("backlash", "note", "the model's error shows backlash between motor and "
                     "encoder", {"explained_deviance": 200.0})  # fmt: skip
     given = replace(estimates["rear_left"], findings=(shown,))
     loop, why = choose_source(given, Loop(sample_time=0.001))
     assert loop.speed_source != "observer"
-    assert "not the observer, which leans on the model: the model's error shows backlash" in why
-    # What is neither shown nor excluded is no reason.
+    assert "not the observer, which depends on the model: the model's error shows backlash" in why
+    # An effect neither significant nor excluded is not a reason.
     doubt = replace(shown, evidence={"p_value": 0.01})
     unsure = replace(given, findings=(doubt,))
     assert choose_source(unsure, Loop(sample_time=0.001))[0].speed_source == "observer"
@@ -154,7 +156,7 @@ def test_the_choice_is_printed_and_can_be_overruled(tmp_path, capsys):
         assert f"speed_source: {chosen}" in output.read_text()
 
 
-def test_what_keeps_gains_from_being_designed_is_advised_and_no_note(estimates):
+def test_a_missing_design_repeats_the_advice_of_warnings_only(estimates):
     found = (
         Finding("not_separable", "note", "a family", advice="record the motor current too"),
         Finding("one_level", "warning", "one level", advice="record two levels of voltage"),
@@ -166,12 +168,12 @@ def test_what_keeps_gains_from_being_designed_is_advised_and_no_note(estimates):
 
 
 def test_an_observer_that_the_driver_contradicts_is_not_taken_nor_its_settling_stated(estimates):
-    """It predicts from a command of which a driver that coasts makes another voltage."""
-    coast = Finding("coast", "warning", "", {"size": 10.0, "full_duty": 12.0, "emf_share": 0.8})
+    """It predicts from the command, from which a coasting driver's voltage differs."""
+    coast = ChainRecord(("coast",), {"fast_decay_ratio": 10.0, "viscous": 0.2})
     plain = replace(estimates["front_left"], findings=())
-    coasting, loop = replace(plain, findings=(coast,)), observed(500.0)
+    coasting, loop = replace(plain, chain=coast, largest_voltage=12.0), observed(500.0)
     assert np.isfinite(design(plain, loop).specification.settling.high)
     assert np.isnan(design(coasting, loop).specification.settling.high)
     chosen, why = choose_source(coasting, replace(loop, speed_source="measured"))
-    assert chosen.speed_source == "difference" and "not the observer, with which some" in why
+    assert chosen.speed_source == "difference" and "not the observer: some" in why
     assert np.isfinite(design(coasting, chosen).specification.settling.high)

@@ -1,4 +1,5 @@
-"""Gains hold on the drive that was identified: its sensor, its friction, and what is not known."""
+# SPDX-License-Identifier: Apache-2.0
+"""Gains keep their margins on the identified drive, with its sensor, friction and uncertainty."""
 
 from __future__ import annotations
 
@@ -11,11 +12,10 @@ import pytest
 from drives import LOOP, TRUE, change, estimate, overshoot
 
 from smp_motor_ident.cli.tune import main as tune
-from smp_motor_ident.diagnosis.systematic import with_systematic
 from smp_motor_ident.errors import DesignError
 from smp_motor_ident.finding import Finding
 from smp_motor_ident.report.document import identification_document
-from smp_motor_ident.result import Estimate, Quantity
+from smp_motor_ident.result import ChainRecord, Estimate, Quantity, Share, Systematic
 from smp_motor_ident.tune import design
 from smp_motor_ident.tune.margins import loop_margins
 from smp_motor_ident.tune.motors import motors_of
@@ -40,12 +40,15 @@ def test_gains_are_of_the_speed_that_the_firmware_reports(sensor, name):
 
 
 @pytest.mark.parametrize("share", [0.05, 0.5])
-def test_a_lag_that_may_be_the_sensors_overshoots_no_change(share):
+def test_a_lag_that_may_be_the_sensors_causes_no_overshoot(share):
     """The motor is ahead of a filter: led as if the lag were its own, it leaves its bands."""
-    doubt = Finding("second_lag", "warning", "two lags, the second 0.5 of the first")
+    doubt = Share("low_passed_speed", 0.3, 0.045)
     lags = {"time_constant": 0.15, "time_constant_product": 0.1 * 0.05}
     filtered = {**TRUE, "time_constant": 0.1, "time_constant_product": 1e-4}
-    aware = design(estimate(findings=[doubt], **lags), LOOP)
+    known = estimate(**lags)
+    lag = replace(known.combinations["time_constant"], systematic=(doubt,))
+    aware = replace(known, combinations={**known.combinations, "time_constant": lag})
+    aware = design(aware, LOOP)
     ignorant = design(estimate(**lags), LOOP)
     stated = ignorant.specification.overshoot.high
     assert overshoot(ignorant, filtered, lag=0.05, share=share) > stated + 5.0
@@ -57,10 +60,9 @@ def test_a_lag_that_may_be_the_sensors_overshoots_no_change(share):
 
 
 def test_changes_are_no_faster_than_the_driver():
-    """Nor late: a driver that ramps follows what is fed forward, whatever the change."""
-    size = {"quantity": "slew_rate", "size": 40.0, "full_duty": 12.0, "emf_share": 1.0}
-    slewed = Finding("slew", "warning", "a driver that ramps", size)
-    one = design(estimate(findings=[slewed]), LOOP)
+    """A driver that ramps follows the feed-forward of every change without lag."""
+    slewed = ChainRecord(("slew",), {"ramp_time": 12.0 / 40.0})
+    one = design(replace(estimate(), chain=slewed, largest_voltage=12.0), LOOP)
     plan, gains, T = one.reference, one.gains, LOOP.sample_time
     for begin, end in ((0.0, 0.5), (0.0, 0.05), (1.0, -1.0), (-0.9, -0.2)):
         profile = plan.profile()
@@ -79,8 +81,9 @@ def test_changes_are_no_faster_than_the_driver():
 def test_gains_from_one_size_of_voltage_hold_at_others():
     """A driver that is clipped where it was recorded has a fifth more gain at half the speed."""
     level = Finding("one_size_of_voltage", "warning", "the voltage has one size, 12 V")
-    hardware = replace(estimate().hardware, voltage_accuracy=0.1)
-    stated = with_systematic(replace(estimate(findings=[level]), hardware=hardware))
+    moves = {"dc_gain": 0.1 * TRUE["dc_gain"], "static_voltage": -0.1 * TRUE["static_voltage"]}
+    error = Systematic("one_size_of_voltage", 0.1, moves)
+    stated = replace(estimate(findings=[level]), systematic=(error,))
     aware, ignorant = design(stated, LOOP), design(estimate(), LOOP)
     more = {**TRUE, "dc_gain": 1.2 * TRUE["dc_gain"]}
     assert overshoot(ignorant, more) > ignorant.specification.overshoot.high + 2.0
@@ -138,13 +141,14 @@ def test_a_second_lag_that_the_record_hides_is_within_the_stated_margins():
     ],
     ids=["a delay for a second lag", "a mean for a filter"],
 )
-def test_what_the_record_does_not_exclude_is_within_the_stated_margins(stated, other):
+def test_motors_that_the_record_does_not_exclude_keep_the_stated_margins(stated, other):
     loop = replace(LOOP, sample_time=0.005, delay=0.005)
     motor = {"time_constant": 0.1, "time_constant_product": 0.0}
     known = estimate(std=0.002, **{**motor, **stated})
-    left_open = {**motor, "dc_gain": known.value("dc_gain"), **other}
-    del left_open["time_constant_product"]  # what it does not have is nothing
-    aware, ignorant = design(replace(known, alternatives=(left_open,)), loop), design(known, loop)
+    left_open = {**dict.fromkeys(stated, 0.0), **other}
+    moves = {name: value - known.value(name) for name, value in left_open.items()}
+    unseen = Systematic("delay", 1.0, moves)
+    aware, ignorant = design(replace(known, systematic=(unseen,)), loop), design(known, loop)
     true = motors_of(estimate(**{**motor, **other}))
 
     def of_true(made):
@@ -156,7 +160,7 @@ def test_what_the_record_does_not_exclude_is_within_the_stated_margins(stated, o
     assert of_true(ignorant).sensitivity > ignorant.specification.sensitivity.high + 0.03
 
 
-def test_unreliable_identification_is_refused_and_widens_what_is_designed_on_it():
+def test_an_unreliable_identification_is_refused_or_widens_the_design():
     with pytest.raises(DesignError, match=r"unreliable: a dead zone of 2 V \(record slow ramps\)"):
         design(estimate(findings=[DOUBT]), LOOP)
     sure = design(estimate(), LOOP)
@@ -182,12 +186,12 @@ def with_friction(quantity: Quantity) -> Estimate:
     "quantity",
     [Quantity(0.0, 1.1e6), Quantity(None, status="unidentifiable"), Quantity(1.0, math.inf)],
 )
-def test_friction_that_may_be_anything_is_refused_with_what_to_record(quantity):
+def test_unknown_friction_is_refused_with_advice_on_recording(quantity):
     with pytest.raises(DesignError, match="record the motor at two or more voltages"):
         design(with_friction(quantity), LOOP)
 
 
-def test_friction_known_as_a_range_is_fed_forward_as_far_as_it_is_known():
+def test_the_lower_end_of_a_friction_range_is_fed_forward():
     one = design(with_friction(Quantity(1.0, 0.5, (0.6, 2.4))), LOOP)
     assert one.gains.feedforward_static == 0.6
     assert any("between 0.6 and 2.4 V" in words for words in one.warnings)
@@ -257,7 +261,7 @@ def test_any_inductance_at_any_rate_ends_in_stable_gains(seed):
     assert math.isfinite(one.specification.settling.value)
 
 
-def test_of_a_fast_loop_no_more_delay_is_asked_than_it_bears():
+def test_a_fast_loop_must_tolerate_only_the_delay_it_can():
     """Two milliseconds are ten samples at 5 kHz: such an answer would be unstable."""
     fast = replace(LOOP, sample_time=2e-4, delay=2e-4, counts_per_revolution=None)
     quick = {"time_constant": 0.01, "time_constant_product": 0.0}
@@ -267,7 +271,7 @@ def test_of_a_fast_loop_no_more_delay_is_asked_than_it_bears():
     assert one.reference.transition_time < 0.1
 
 
-def test_no_gain_margin_is_vouched_for_beyond_the_band_of_the_record():
+def test_no_gain_margin_is_stated_beyond_the_band_of_the_record():
     """Half a row of delay, that no record excludes, is all that such a crossing depends on."""
     loop = replace(LOOP, sample_time=0.001, delay=None, counts_per_revolution=28.0)
     one = design(estimate(time_constant=0.03, time_constant_product=0.0), loop)

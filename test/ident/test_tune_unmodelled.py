@@ -1,4 +1,5 @@
-"""Gains bear what a recording leaves open of the motor's response."""
+# SPDX-License-Identifier: Apache-2.0
+"""Gains tolerate the unmodelled dynamics that a recording does not exclude."""
 
 from __future__ import annotations
 
@@ -58,7 +59,7 @@ def sensitivity(one, omega):
     return np.abs(loop / (1 + loop))
 
 
-def test_loop_does_not_reach_beyond_what_the_recording_shows():
+def test_the_loop_stays_within_the_excited_band():
     loop = replace(LOOP, difference_window=0)
     free, held = (design(known_up_to(f), loop) for f in (600.0, 5.0))
     omega = np.geomspace(10.0, 600.0, 100)
@@ -72,7 +73,7 @@ def test_loop_does_not_reach_beyond_what_the_recording_shows():
 
 
 @pytest.mark.parametrize("method", sorted(METHODS))
-def test_every_method_keeps_within_what_the_recording_shows(method):
+def test_every_method_stays_within_the_excited_band(method):
     held = design(known_up_to(20.0), replace(LOOP, difference_window=0), method)
     assert sensitivity(held, np.geomspace(50.0, 600.0, 100)).max() < 0.51
 
@@ -93,14 +94,14 @@ def test_error_that_is_not_shown_does_not_count_in_full():
     assert weight(np.array([5000.0])) == pytest.approx(2.0)
 
 
-def test_voltage_that_changes_at_one_pace_leaves_a_loop_what_is_slower():
+def test_a_single_frequency_of_voltage_supports_slower_loops():
     """A sine moves the motor nowhere below its frequency; integral action needs the gain there."""
     loop = replace(LOOP, difference_window=0)
     bound = tuple(50.0 if f < 10.0 else 0.05 for f in FREQUENCY)
     one = design(estimate(tuple(5.0 if b > 1 else 0.01 for b in bound), bound), loop)
     known = design(known_up_to(600.0), loop)
     assert one.gains.i == pytest.approx(known.gains.i, rel=1e-6)
-    # What is shown there counts: the response itself may be gone.
+    # A significant error counts: the response itself may vanish there.
     shown = tuple(20.0 if b > 1 else 0.01 for b in bound)
     bound = tuple(21.0 if b > 1 else b for b in bound)
     with pytest.raises(DesignError):
@@ -113,8 +114,8 @@ def test_recording_that_shows_nothing_is_refused_with_the_reason():
         design(nothing, LOOP)
 
 
-def test_observer_bears_more_of_what_it_does_not_feed_back():
-    # What the observer predicts from the voltage is the model's, whatever the motor does.
+def test_an_observer_tolerates_more_model_error_outside_its_feedback():
+    # The observer's prediction from the voltage depends on the model only.
     loop = replace(LOOP, counts_per_revolution=500.0, speed_source="observer")
     motors = motors_of(known_up_to(20.0))
     plant = sample(motors, loop)
@@ -144,7 +145,7 @@ def test_gain_of_unmodelled_dynamics_is_that_of_the_formula():
     assert problem.unmodelled_gain(feedback) == pytest.approx(expected)
 
 
-def test_gains_file_says_what_the_loop_bears():
+def test_the_gains_file_states_the_tolerated_model_error():
     held = design(known_up_to(5.0), LOOP)
     entry = gains_document({"motor": held}, {}, "")["wheels"]["motor"]
     assert entry["robustness"]["unmodelled"] == held.robustness.unmodelled
@@ -174,7 +175,7 @@ def end(y, T):
     return T * (np.flatnonzero(np.abs(y - 1) > 0.02)[-1] + 1)
 
 
-def test_what_a_resonance_adds_is_that_of_a_simulated_one():
+def test_the_effect_of_a_resonance_equals_that_of_a_simulated_one():
     """Without feedback, of resonances from 20 rad/s on that nothing but their mass bounds."""
     T = 0.002
     reference = minimum_jerk(T, 0.2, 2500)
@@ -208,7 +209,7 @@ def looped(D, feedback, volts, T):
     return np.array(out).T
 
 
-def test_every_resonance_within_the_bound_stays_within_what_it_is_said_to_add():
+def test_every_resonance_within_the_bound_stays_within_its_stated_effect():
     loop, feedback = replace(LOOP, difference_window=0), Feedback(0.02, 0.3)
     T, s = loop.sample_time, control.tf([1, 0], [1])
     one = known_up_to(20.0)
@@ -229,7 +230,7 @@ def test_every_resonance_within_the_bound_stays_within_what_it_is_said_to_add():
     assert max(added) <= 1.02 * more
     assert max(added) > 0.7 * more
     assert max(ends) <= longer + np.pi / 40
-    # Half of what it would be of one without damping that is all of the motor, where W is 2.
+    # Half of the value for an undamped resonance of the whole motor, where W is 2.
     turned = np.exp(-50j * T * np.arange(399))
     assert more < 0.5 * np.abs(turned @ np.diff(25.0 * volts))
 

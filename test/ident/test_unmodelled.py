@@ -1,4 +1,5 @@
-"""What a recording tells about the response, frequency by frequency, with its confidence."""
+# SPDX-License-Identifier: Apache-2.0
+"""Model error of the response by frequency, with its confidence region."""
 
 from __future__ import annotations
 
@@ -7,8 +8,8 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from smp_motor_ident.diagnosis.unmodelled import relative_error
 from smp_motor_ident.estimate import estimate
+from smp_motor_ident.infer.unmodelled import relative_error
 from smp_motor_ident.record import Record
 from smp_motor_ident.report.document import identification_document, read_identification
 
@@ -34,7 +35,7 @@ def test_circle_holds_the_error_as_often_as_it_says():
 
 
 def test_circle_of_windowed_noise_holds_nothing_as_often_as_it_says():
-    # Noise alone under a Hann window, whose neighbouring lines hang together.
+    # Noise alone under a Hann window, whose neighbouring lines are correlated.
     inside, bands = 0, 0
     window = np.hanning(2002)[1:-1]
     for seed in range(200):
@@ -51,7 +52,7 @@ def test_bound_grows_where_the_output_is_small():
     omega, error, output = lines(rng, noise=0.01)
     found = relative_error(omega, error, output / (1 + (omega / 10) ** 2))
     bound = np.array(found.bound)
-    # A response that falls to 1/50 or less in the last band, of which 25 times the lines tell.
+    # A response that falls to 1/50 or less in the last band, with 25 times the lines.
     assert bound[0] < 0.02
     assert bound[-1] > 5 * bound[0]
 
@@ -65,7 +66,7 @@ def test_resonance_narrower_than_its_band_is_shown_by_its_peak():
         error += 3.0 * 5j * omega / (50.0**2 - omega**2 + 5j * omega) * output
         shown = relative_error(omega, error, output)
         k = int(np.argmin(np.abs(np.log(np.array(shown.frequency) / 50.0))))
-        # Three, and what half of the distance to the next resonance looked for takes of it.
+        # Three, less the loss at half of the distance to the next tested resonance.
         assert shown.bound[k] > 2.4
         found += 2 * shown.shown[k] > shown.bound[k] + 1
         missed += shown.bound[k] < 3.0

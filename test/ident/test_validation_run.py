@@ -1,10 +1,11 @@
+# SPDX-License-Identifier: Apache-2.0
 """A run that no fit has seen, judged by the errors of the fit."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from smp_motor_ident.diagnosis.validation_run import Simulated, judge
+from smp_motor_ident.commission.validation_run import Simulated, judge
 
 TIME = np.arange(0.0, 10.0, 0.005)
 SPEED = 100.0 * np.sin(2.0 * TIME)
@@ -21,8 +22,8 @@ def test_a_motor_that_did_not_change_is_stated_and_rarely_refused() -> None:
     found = [judge("left", [run(2 * k, 5.0)], [run(2 * k + 1, 5.0)]) for k in range(200)]
     # One in a hundred by chance: more than seven of 200 have a probability of a thousandth.
     assert sum(f.severity == "refused" for f in found) <= 7
-    assert "no fit has seen" in found[0].message
-    # Errors of 5 rad/s beside a speed of 71 rad/s rms.
+    assert "in the validation run" in found[0].message
+    # Errors of 5 rad/s with a speed of 71 rad/s rms.
     assert abs(found[0].evidence["fit_percent"] - 93.0) < 1.5
 
 

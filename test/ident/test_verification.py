@@ -1,4 +1,5 @@
-"""A drive on new gains against what was predicted of it."""
+# SPDX-License-Identifier: Apache-2.0
+"""A drive on new gains compared with its prediction."""
 
 from __future__ import annotations
 
@@ -103,7 +104,7 @@ def test_samples_that_nobody_answered_are_in_the_prediction(designed: Design) ->
 def test_what_the_integral_keeps_from_one_change_to_the_next_is_in_the_prediction(
     designed: Design,
 ) -> None:
-    # Friction of 2 V holds the wheel after each stop: the integral keeps what it had.
+    # Friction of 2 V holds the wheel after each stop, so the integral stays.
     m = ENTRY.parameters
     rubbing = MotorParameters.from_combinations(
         dc_gain=m.dc_gain, time_constant=m.time_constant,
@@ -195,7 +196,7 @@ def test_a_speed_that_stays_off_is_refused(designed: Design) -> None:
 
 
 def test_a_wheel_that_never_arrives_is_refused_in_words(designed: Design) -> None:
-    # Twice what 12 V can push: the wheel stands still.
+    # Twice the torque of 12 V blocks the wheel.
     stall = 2.0 * ENTRY.gearbox.ratio * 12.0 * ENTRY.parameters.motor_constant
     found = v.judge([drive(designed, load=stall / ENTRY.parameters.resistance)])
     assert any("more than was recorded" in f.message for f in found)

@@ -1,4 +1,5 @@
-"""The checks before a commissioning: what a small test of the wheels shows, and what is said."""
+# SPDX-License-Identifier: Apache-2.0
+"""The checks before a commissioning: results of a short test of the wheels, and findings."""
 
 from __future__ import annotations
 
@@ -9,8 +10,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from smp_motor_ident.diagnosis.wheel_checks import Robot, judge
-from smp_motor_ident.diagnosis.wheel_test import (
+from smp_motor_ident.commission.wheel_checks import Robot, judge
+from smp_motor_ident.commission.wheel_test import (
     Figures,
     Phase,
     Trace,
@@ -71,7 +72,7 @@ GOOD = shown()
 
 
 def codes(*odd: Figures, hardware: Hardware = HARDWARE, **known: object) -> dict[str, str]:
-    """Return code and severity of what is said of three good wheels and odd ones beside them."""
+    """Return codes and severities of the findings for three good wheels and some odd ones."""
     names = [f"wheel_{k}" for k in range(3 + len(odd))]
     found = judge(
         Robot(dict(zip(names, (*odd, GOOD, GOOD, GOOD))), dict.fromkeys(names, hardware), **known)
@@ -124,7 +125,7 @@ def test_a_wheel_that_does_not_turn_is_refused_by_name() -> None:
 
 def test_plugs_of_two_wheels_that_are_exchanged_are_separated_from_a_belt() -> None:
     (seen, phases), (still, _) = trace(), trace(driven=False)
-    # What is sent to the left turns the right.
+    # Commands to the left turn the right.
     moved = moved_with({"left": still, "right": seen}, phases)
     robot = Robot({"left": GOOD, "right": GOOD}, dict.fromkeys(("left", "right"), HARDWARE), moved)
     assert "crossed_wheels" in {f.code for f in judge(robot)}
@@ -194,7 +195,7 @@ def test_the_voltage_grows_until_friction_is_a_tenth_and_counts_are_enough() -> 
 
 
 def test_samples_that_wait_in_a_queue_show_the_same_motor() -> None:
-    # A busy computer takes samples 0.2 s late: a phase begins with what the one before did.
+    # A busy computer takes samples 0.2 s late: a phase begins with samples of the one before.
     seen, phases = trace()
     late = np.concatenate([np.full(40, seen.phase[0]), seen.phase[:-40]])
     found = figures(replace(seen, phase=late), phases, HARDWARE)

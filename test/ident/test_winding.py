@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A winding's temperature between two recordings of a commissioning."""
 
 from __future__ import annotations
@@ -8,7 +9,7 @@ import numpy as np
 import pytest
 from independent import simulate
 
-from smp_motor_ident.diagnosis.winding import heated, resistance
+from smp_motor_ident.commission.winding import heated, resistance
 from smp_motor_ident.record import Record
 
 R, L, K, J, B, TC = 3.2, 2e-3, 0.03, 1.4e-5, 5.5e-5, 2e-3

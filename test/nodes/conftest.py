@@ -1,4 +1,5 @@
-"""What the tests of nodes share."""
+# SPDX-License-Identifier: Apache-2.0
+"""Fixtures of the tests of nodes."""
 
 from __future__ import annotations
 

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """excite as its own process, on a simulated motor."""
 
 from __future__ import annotations
@@ -69,7 +70,7 @@ def test_excite_leaves_a_wheel_that_another_drives_alone(process, robot, eventua
     eventually(lambda: robot.velocity("front_left") > 0.3, 30.0, robot.spin)
     excite = process("excite", "--ros-args", "-p", "signal:=square")
     eventually(lambda: excite.returncode is not None, 20.0, robot.spin, excite.output)
-    assert excite.returncode == 2 and "not yours, /front_left/wheel_pid#" in excite.output
+    assert excite.returncode == 2 and "/front_left/wheel_pid#" in excite.output
     assert robot.velocity("front_left") > 0.3
     robot.setpoint = None
     excite = process("excite", "--ros-args", "-p", "signal:=square", "-p", "duration:=2.0")
@@ -100,9 +101,9 @@ def test_a_wheel_that_is_too_fast_or_is_not_heard_ends_the_signal(process, robot
     [
         ("amplitude:=20.0", "must not exceed max_voltage"),
         ("signal:=noise", "known are sine"),
-        ("wheels:=[left]", "nobody listens on /left/motor_command"),
+        ("wheels:=[left]", "no subscriber on /left/motor_command"),
         ("duration:=-1.0", "duration is -1.0"),
-        ("wait:=0.2", "nobody listens on /front_left/motor_command"),
+        ("wait:=0.2", "no subscriber on /front_left/motor_command"),
     ],
 )
 def test_excite_refuses_in_one_line(process, given, words):

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """identifier as its own process, on a plant that others excite."""
 
 from __future__ import annotations
@@ -35,7 +36,7 @@ def test_it_demands_motion_before_it_names_a_number_and_then_names_the_right_one
     settings = ["-p", "period:=1.0", "-p", "window:=12.0", "-p", "wheels:=[front_left]"]
     identifier = process("identifier", "--ros-args", *settings)
     eventually(lambda: heard, 30.0, robot.spin, "nothing heard")
-    # At rest: the status says what is missing, and there is no number.
+    # At rest: the status lists the missing excitation, and there are no values.
     eventually(lambda: "turned for 0.0" in heard[-1].status, 10.0, robot.spin, "no reason")
     assert all(not m.names and m.status.startswith("collecting") for m in heard)
     assert math.isnan(heard[-1].fit_percent)

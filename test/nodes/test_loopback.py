@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """No node of a test, or of the demo, can be reached from another computer."""
 
 from __future__ import annotations
@@ -37,4 +38,4 @@ def test_nodes_bind_to_loopback_and_hear_each_other(process, node, eventually) -
 
 def test_another_middleware_gets_the_range_that_every_one_knows(monkeypatch) -> None:
     monkeypatch.setenv("RMW_IMPLEMENTATION", "rmw_cyclonedds_cpp")
-    assert loopback.environment() == {"ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
+    assert loopback.loopback_environment() == {"ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """motor_plant as its own process."""
 
 from __future__ import annotations
@@ -60,7 +61,7 @@ def test_plant_turns_on_commands_stops_without_and_describes_itself(process, rob
     assert idle[-1].encoder_count == 0
 
     eventually(lambda: front[-1].voltage == 0.0, 5.0, lambda: command(math.nan, 0.1))
-    eventually(lambda: robot.named("motor_plant", "no numbers"), 3.0, robot.spin)
+    eventually(lambda: robot.named("motor_plant", "non-finite messages"), 3.0, robot.spin)
     command(6.0, 0.5)
     before = time.monotonic()
     eventually(lambda: front[-1].voltage == 0.0, 2.0, robot.spin, "no time-out")
@@ -115,7 +116,7 @@ def test_wheel_obeys_one_writer_until_that_one_rests(process, robot, eventually)
     # All six tenths of a second at 6 V, to half a step of the PWM.
     assert min(m.voltage for m in front[-20:]) > 5.98
     assert owners[-1] == "first"
-    eventually(lambda: robot.named("motor_plant", "not yours"), 3.0, robot.spin)
+    eventually(lambda: robot.named("motor_plant", "another node owns the wheel"), 3.0, robot.spin)
     command(first=0.0, second=-6.0)
     assert owners[-1] == "second" and front[-1].voltage == pytest.approx(-6.0, abs=0.013)
     eventually(lambda: owners[-1] == "", 3.0, robot.spin, "the lease does not end")

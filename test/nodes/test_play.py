@@ -1,4 +1,5 @@
-"""play as a process: what was recorded, in its own time, and nothing else."""
+# SPDX-License-Identifier: Apache-2.0
+"""play as a process: it sends the recorded messages at their times, and nothing else."""
 
 from __future__ import annotations
 
@@ -74,7 +75,7 @@ def listener(node: Node) -> Iterator[Listener]:
     made.close()
 
 
-def test_play_sends_byte_for_byte_what_was_recorded_in_its_own_time(
+def test_play_sends_the_recorded_bytes_at_their_times(
     process: Callable[..., Any], listener: Listener, tmp_path: Path
 ) -> None:
     written = write_bag(tmp_path / "bag")
@@ -101,7 +102,7 @@ def test_play_goes_faster_from_an_offset_with_a_clock_and_chosen_topics(
     assert listener.data["/text"] == []
     times = listener.times["/number"]
     assert times[-1] - times[0] == pytest.approx(0.98, abs=0.3)
-    # 0.98 s at 100 Hz, of which a loaded machine may skip some.
+    # 0.98 s at 100 Hz; a loaded machine may skip some.
     assert 40 <= len(listener.data["/clock"]) <= 110
 
 
@@ -119,7 +120,7 @@ def test_play_loops_until_it_is_interrupted(
     assert listener.data["/number"][:20] == written["/number"] * 2
 
 
-def test_what_is_recorded_while_playing_is_the_same_bag(
+def test_recording_a_played_bag_gives_the_same_bag(
     process: Callable[..., Any], eventually: Callable[..., None], tmp_path: Path
 ) -> None:
     written = write_bag(tmp_path / "bag")
@@ -144,7 +145,7 @@ def test_what_is_recorded_while_playing_is_the_same_bag(
         (("bag", "--fast"), "unrecognized arguments"),
     ],
 )
-def test_play_refuses_what_it_cannot_do_in_one_line(
+def test_play_refuses_invalid_arguments_in_one_line(
     process: Callable[..., Any], tmp_path: Path, arguments: tuple[str, ...], reason: str
 ) -> None:
     write_bag(tmp_path / "bag", count=3)

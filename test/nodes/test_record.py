@@ -1,4 +1,5 @@
-"""record as a process: nothing lost, nothing changed, whatever ends it."""
+# SPDX-License-Identifier: Apache-2.0
+"""record as a process: nothing is lost or changed, however it ends."""
 
 from __future__ import annotations
 
@@ -53,7 +54,7 @@ def test_four_wheels_at_a_kilohertz_are_recorded_without_a_lost_message(
     eventually(lambda: all(p.get_subscription_count() for p in publishers), deadline=20.0)
     sent = publish_steadily(publishers, 2000, 1000.0)
     if ending == signal.SIGKILL:
-        # What a kill may cost is what came since the last flush, half a second ago at most.
+        # A kill loses at most the messages since the last flush, half a second.
         eventually(lambda: all_states(so_far(bag)) == [2000] * 4, deadline=10.0, message="flush")
     else:
         for publisher in publishers:
@@ -96,8 +97,8 @@ def test_best_effort_messages_are_recorded_or_told_as_lost(
     for name in names:
         places = [sent.index(data) for data in found[name]]
         assert places == sorted(set(places))
-        # The kernel holds some hundred messages for a process that does not run: a machine that
-        # stands still for half a second may lose as many.
+        # The kernel buffers some hundred messages for a suspended process: half a second of
+        # suspension may lose as many.
         assert len(places) > 850
         lost = places[-1] - places[0] + 1 - len(places)
         said = re.search(rf"{name}  \((\d+) lost\)", recorder.output)
@@ -113,8 +114,8 @@ def test_late_publishers_latched_ones_and_mixed_qos_are_recorded(
     recorder = process("record", "-o", bag)
     eventually(lambda: description.get_subscription_count() > 0, deadline=20.0)
     late = node.create_publisher(Float64, "/late", BEST_EFFORT)
-    # A second, reliable publisher of a topic that is taken best effort changes nothing; a best
-    # effort one beside a reliable one makes the recorder ask for less.
+    # A second, reliable publisher of a topic taken best effort changes nothing; a best effort one
+    # in addition to a reliable one makes the recorder request best effort.
     mixed = [node.create_publisher(Float64, "/mixed", RELIABLE)]
     eventually(lambda: mixed[0].get_subscription_count() > 0)
     mixed.append(node.create_publisher(Float64, "/mixed", BEST_EFFORT))
@@ -165,8 +166,8 @@ def test_a_bag_is_replaced_only_by_force_and_nothing_else_ever(
     (folder / "thesis.txt").write_text("important")
     for arguments, reason in (
         (("-o", bag), "exists already"),
-        (("-o", folder, "--force"), "is no bag"),
-        (("-o", bag, "--regex", "("), "no regular expression"),
+        (("-o", folder, "--force"), "is not a bag"),
+        (("-o", bag, "--regex", "("), "not a regular expression"),
     ):
         refused = process("record", *arguments)
         assert refused.wait(20.0) == 2

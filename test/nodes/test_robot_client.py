@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The client of a running robot against a wheel whose graph becomes known piece by piece."""
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ from smp_motor_control.nodes.runtime import LATCHED
 
 
 class Wheel:
-    """A driver's word on who drives, and the services of that controller."""
+    """Diagnostics of a driver on its writer, and the services of that controller."""
 
     def __init__(self, node) -> None:
         self.node, self.state = node, "active"
@@ -64,7 +65,7 @@ def test_a_controller_that_only_the_driver_names_yet_is_paused_and_activated_aga
 
 
 def test_a_wheel_that_stays_anothers_is_refused_with_its_driver(wheel, monkeypatch):
-    monkeypatch.setattr("smp_motor_control.nodes.robot_client.PATIENCE", 3.0)
+    monkeypatch.setattr("smp_motor_control.nodes.robot_client.TIMEOUT_S", 3.0)
     wheel.owners.publish(String(data="/teleop#9"))
     with (
         RobotClient(name="tester_of_pause", guarded=False) as client,

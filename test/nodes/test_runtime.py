@@ -1,4 +1,5 @@
-"""What nodes share: the lean executor, settings, and how a process starts and ends."""
+# SPDX-License-Identifier: Apache-2.0
+"""Common code of nodes: the lean executor, settings, start and end of a process."""
 
 from __future__ import annotations
 
@@ -21,7 +22,7 @@ from std_srvs.srv import Trigger
 
 from smp_motor_control.errors import ParameterError
 from smp_motor_control.fields import described
-from smp_motor_control.nodes.executor import LeanExecutor, Untouched, _WaitSet
+from smp_motor_control.nodes.executor import LeanExecutor, OwnerReads, _WaitSet
 from smp_motor_control.nodes.runtime import STREAM_PUBLISHER, STREAM_SUBSCRIBER, steady_timer
 from smp_motor_control.nodes.settings import Parameters
 
@@ -122,7 +123,7 @@ def test_lean_executor_lives_through_entities_made_and_destroyed_in_callbacks(co
 
 @pytest.fixture
 def waits(monkeypatch) -> Counter[str]:
-    """Count what the executor waits for: messages alone, or everything."""
+    """Count the executor's waits: for messages alone, or for everything."""
     counted: Counter[str] = Counter()
     wait = _WaitSet.wait
 
@@ -135,7 +136,7 @@ def waits(monkeypatch) -> Counter[str]:
     return counted
 
 
-def test_a_stream_is_waited_for_alone_and_keeps_nobody_waiting_for_long(context, executor, waits):
+def test_waiting_for_a_stream_delays_other_callbacks_only_briefly(context, executor, waits):
     node = rclpy.create_node("streaming", context=context)
     executor.add_node(node)
     node.create_service(Trigger, "ask", lambda _, r: Trigger.Response(success=True))
@@ -170,11 +171,11 @@ def test_a_stream_is_waited_for_alone_and_keeps_nobody_waiting_for_long(context,
     call()
 
 
-def test_messages_that_their_owner_takes_wake_nobody(context, executor):
+def test_messages_taken_by_their_owner_wake_no_executor(context, executor):
     node = rclpy.create_node("batches", context=context)
     executor.add_node(node)
     kept = node.create_subscription(
-        Float64, "batch", lambda _: None, STREAM_SUBSCRIBER, callback_group=Untouched()
+        Float64, "batch", lambda _: None, STREAM_SUBSCRIBER, callback_group=OwnerReads()
     )
     publisher = node.create_publisher(Float64, "batch", STREAM_PUBLISHER)
     spin_until(executor, node, lambda: publisher.get_subscription_count() == 1)
@@ -184,13 +185,13 @@ def test_messages_that_their_owner_takes_wake_nobody(context, executor):
     while time.monotonic() < begun + 1.0:
         executor.spin_once()
         rounds += 1
-    assert rounds < 30  # of the timer, and what the node's birth left to do
+    assert rounds < 30  # of the timer and the node's start
     with kept.handle:
         message, _ = kept.handle.take_message(Float64, False)
     assert message.data == 7.0
 
 
-def test_an_event_of_what_was_just_destroyed_does_not_end_the_spin(context, executor):
+def test_an_event_of_a_destroyed_entity_does_not_end_the_spin(context, executor):
     node = rclpy.create_node("destroying", context=context)
     executor.add_node(node)
     reliable = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE)
@@ -284,7 +285,7 @@ def test_signal_ends_a_node_cleanly_within_two_seconds(process, eventually, numb
     assert "stopped" in node.output
 
 
-def test_node_that_raises_still_stops_its_motors_and_says_why(process):
+def test_a_node_that_raises_stops_its_motors_and_reports_the_error(process):
     node = process(sys.executable, "-c", PROGRAM.format(work="raise ValueError('too bad')"))
     assert node.wait(20.0) == 1
     assert "stopped" in node.output

@@ -1,4 +1,5 @@
-"""security/policy.xml allows every node what it really uses, and the motors' commands to few."""
+# SPDX-License-Identifier: Apache-2.0
+"""security/policy.xml allows each node the topics it uses, and few nodes the motor commands."""
 
 from __future__ import annotations
 
@@ -38,7 +39,7 @@ NODES: list[tuple[str, Callable[[], Node]]] = [
 
 
 def allowed() -> dict[str, Allowed]:
-    """What the policy allows, full names by the node's path and by the kind of access."""
+    """Return the policy's rules: full names by the node's path and by the kind of access."""
     result: dict[str, Allowed] = {}
     for context in POLICY.iter("context"):
         (profile,) = context.iter("profile")
@@ -57,7 +58,7 @@ def allowed() -> dict[str, Allowed]:
 
 
 def used(make: Callable[[], Node], namespace: str, domain: int) -> tuple[str, Allowed]:
-    """Make a node and return what it publishes, hears and answers."""
+    """Make a node and return its publications, subscriptions and services."""
     rclpy.init(args=["--ros-args", "-r", f"__ns:={namespace}"], domain_id=domain)
     try:
         node = make()
@@ -74,8 +75,10 @@ def used(make: Callable[[], Node], namespace: str, domain: int) -> tuple[str, Al
 
 
 @pytest.mark.parametrize(("namespace", "make"), NODES[3:], ids=lambda x: getattr(x, "__name__", ""))
-def test_a_node_is_allowed_what_it_uses(namespace, make, ros_domain, monkeypatch) -> None:
-    monkeypatch.setattr(teleop_wheels, "Terminal", Mock())  # there is none
+def test_the_policy_allows_a_node_the_topics_it_uses(
+    namespace, make, ros_domain, monkeypatch
+) -> None:
+    monkeypatch.setattr(teleop_wheels, "Terminal", Mock())  # tests have no terminal
     path, access = used(make, namespace, ros_domain)
     rules = allowed()[path]
     for kind, names in access.items():

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """serial_driver over a pseudo-terminal, with a firmware that loses bytes, resets and vanishes."""
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ from rclpy.node import Node
 from smp_interfaces.msg import MotorCommand, MotorState
 from smp_motor_control.errors import ParameterError
 from smp_motor_control.nodes.serial_driver import Settings
-from smp_motor_control.serial_protocol import Lines, decode_state, encode, encode_voltages
+from smp_motor_control.serial_protocol import LineSplitter, decode_state, encode, encode_voltages
 
 GAIN = 20.0
 """Of the board's motors [rad/s/V]: they answer at once, so the truth is a product."""
@@ -66,7 +67,7 @@ class Firmware(threading.Thread):
         self.start_clock = time.monotonic()
 
     def run(self) -> None:
-        lines, before = Lines(), time.monotonic()
+        lines, before = LineSplitter(), time.monotonic()
         while self.running:
             time.sleep(PERIOD)
             now = time.monotonic()
@@ -83,7 +84,7 @@ class Firmware(threading.Thread):
             with contextlib.suppress(OSError):
                 os.write(self.master, self.report(now))
 
-    def listen(self, lines: Lines, now: float) -> None:
+    def listen(self, lines: LineSplitter, now: float) -> None:
         for line in lines.feed(os.read(self.master, 4096)):
             text, _, _ = line.rpartition("*")
             if encode(text).decode().strip() == line and text.startswith("V,"):
@@ -157,7 +158,7 @@ def test_it_drives_through_lost_bytes_resets_and_unplugging(
 
 @pytest.fixture
 def robot(node: Node) -> Any:
-    """What a board's two wheels report, and their commands."""
+    """A client with the states and commands of a board's two wheels."""
 
     class Robot:
         def __init__(self) -> None:
@@ -195,11 +196,11 @@ def test_no_supply_that_a_board_reports_turns_zero_into_motion(
     asked = [-1e-3 * battery] * 2 if usable else [-3.0, -3.0]
     eventually(lambda: board.obeyed[-1] == asked, 20.0, robot.drive, started.output)
     assert all(-1.0 <= state.duty_cycle <= 0.0 for state in robot.seen)
-    words = "switched off" if usable else "driving" if battery == "" else "no battery's"
+    words = "switched off" if usable else "driving" if battery == "" else "impossible for a battery"
     eventually(lambda: any(words in m for m in robot.diagnoses), 5.0, robot.drive, robot.diagnoses)
 
 
-def test_a_board_that_stood_still_is_told_little_of_what_was_meant_for_then(
+def test_a_suspended_board_gets_few_outdated_commands(
     board: Firmware, robot: Any, process: Any, eventually: Any
 ) -> None:
     started = process(
@@ -215,7 +216,7 @@ def test_a_board_that_stood_still_is_told_little_of_what_was_meant_for_then(
     board.stalled = False
     eventually(lambda: [0.0, 0.0] in board.obeyed, 20.0, robot.drive, started.output)
     stale = board.obeyed.index([0.0, 0.0])
-    # Answers to what it reported at last, and a fifth of a second of keeping it alive.
+    # Answers to its last reports, and a fifth of a second of keep-alive commands
     assert stale <= 7
     eventually(lambda: len(board.obeyed) > stale + 50, 20.0, robot.drive)
     assert board.obeyed[stale:] == [[0.0, 0.0]] * (len(board.obeyed) - stale)
@@ -226,7 +227,7 @@ def test_every_command_follows_the_clock_of_the_sample_that_it_answers(
 ) -> None:
     told: list[tuple[int, float]] = []
 
-    def listen(lines: Lines, now: float) -> None:
+    def listen(lines: LineSplitter, now: float) -> None:
         clock = int((now - board.start_clock) * 1e6)
         for line in lines.feed(os.read(board.master, 4096)):
             if line.startswith("A,"):
@@ -263,7 +264,7 @@ def test_lines_that_no_board_sends_end_nothing(
     assert started.returncode is None
 
 
-def test_a_device_that_is_no_terminal_is_named_and_leaks_nothing(
+def test_a_device_that_is_not_a_terminal_is_named_and_closed(
     tmp_path: Path, robot: Any, process: Any, eventually: Any
 ) -> None:
     (tmp_path / "notes.txt").write_text("no terminal\n")

@@ -1,4 +1,5 @@
-"""Every node in simulated time: a clock that is missing is named, one that is there is followed."""
+# SPDX-License-Identifier: Apache-2.0
+"""Every node in simulated time: it reports a missing clock and follows a present one."""
 
 from __future__ import annotations
 
@@ -26,7 +27,7 @@ NODES = {
     "serial_driver": ("-p", "wheel_names:=[another]", "-p", "device:=/dev/none"),
     "excite": ("-p", "wheel_names:=[nobody]", "-p", "wait:=1000.0"),
 }
-MISSING = "nothing is heard on /clock"
+MISSING = "/clock is not published"
 
 
 def test_a_missing_clock_is_named_by_every_node_and_a_present_one_followed(
@@ -75,7 +76,7 @@ class Pace:
 
     def step(self) -> None:
         before, self.real = self.real, time.monotonic()
-        # What a busy machine leaves out is not made up for.
+        # Skipped time on a busy machine is not made up for.
         self.now += min(self.factor * (self.real - before), 0.005)
         message = Clock()
         message.clock.sec, message.clock.nanosec = int(self.now), int(self.now % 1 * 1e9)
@@ -117,7 +118,7 @@ def test_simulated_motors_move_in_simulated_time(
     last = states[-1].position
     eventually(lambda: len(states) > before + 5, 20.0, pace.step)
     assert abs(states[-1].position - last) < 0.5
-    # And one that stands still stops the motors, and their feedback.
+    # A stopped clock stops the motors and their feedback.
     quiet = len(states)
     end = time.monotonic() + 0.5
     while time.monotonic() < end:

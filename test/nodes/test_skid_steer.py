@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """skid_steer as its own process: commands, limits, parameters, leaving."""
 
 from __future__ import annotations
@@ -98,7 +99,7 @@ def test_another_type_that_is_published_too_is_named(skid_steer, peer, process, 
         "p = rclpy.create_node('nav').create_publisher(Twist, 'cmd_vel', 1)\ntime.sleep(60)\n"
     )
     process(sys.executable, "-c", program)
-    said = "also published as Twist, which is not heard"
+    said = "also published as Twist, which is ignored"
     repeatedly(peer, lambda: peer.command(0.5), lambda: peer.diagnosis(said), eventually, 15.0)
     assert peer.drives(5.0, 5.0)
 

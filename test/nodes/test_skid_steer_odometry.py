@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Odometry of skid_steer as its own process: from feedback, over stalls, in simulated time."""
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ def test_odometry_follows_simulated_time_at_half_the_pace(skid_steer, peer, even
     """At 1 rad/s of simulated time the body moves at 0.1 m/s of it, whatever passes outside."""
     clock = peer.node.create_publisher(Clock, "/clock", 10)
     skid_steer("-p", "use_sim_time:=true")
-    eventually(lambda: peer.diagnosis("nothing is heard on /clock"), deadline=5.0, step=peer.spin)
+    eventually(lambda: peer.diagnosis("/clock is not published"), deadline=5.0, step=peer.spin)
     begun = time.monotonic()
 
     def simulate() -> None:

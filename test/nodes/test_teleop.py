@@ -1,4 +1,5 @@
-"""teleop_wheels as its own process in a terminal of its own."""
+# SPDX-License-Identifier: Apache-2.0
+"""teleop_wheels as a process in its own terminal."""
 
 from __future__ import annotations
 
@@ -42,7 +43,7 @@ class Terminal:
             stderr=self.slave,
             preexec_fn=adopt,
         )
-        # Unread, the terminal would be full after some hundred lines, and stop what it shows.
+        # Unread, the terminal's buffer would fill after some hundred lines and block it.
         self._reader = threading.Thread(target=self._read, daemon=True)
         self._reader.start()
 
@@ -87,7 +88,7 @@ def terminal(ros_domain: int) -> Iterator:
 
 
 class Listener(DomainNode):
-    """What the robot would be asked."""
+    """The commands to the robot."""
 
     def __init__(self, domain: int) -> None:
         super().__init__(domain, "robot")

@@ -1,4 +1,5 @@
-"""Two publishers of one wheel, as of a forgotten node, are named by everybody who reads it."""
+# SPDX-License-Identifier: Apache-2.0
+"""Two publishers of one wheel, such as a forgotten node, are reported by every reader."""
 
 from __future__ import annotations
 
@@ -11,14 +12,14 @@ from domain_node import DomainNode
 from sensor_msgs.msg import JointState
 
 from smp_interfaces.msg import MotorCommand, MotorState
-from smp_motor_control.nodes.publishers import FALLS, PublisherWatch
+from smp_motor_control.nodes.publishers import DECISIVE_FALLS, PublisherWatch
 from smp_motor_control.nodes.robot_client import RobotClient, RobotError
 
 WHEELS = ("left", "right")
 STUCK = ["--ros-args", "-r", "__ns:=/left", "-p", "p:=2.0", "-p", "stall_time:=0.0",
          "-p", "tracking_time:=0.0"]  # fmt: skip
 """Arguments of a wheel_pid that takes no offence at a wheel that never turns."""
-BOTH = "/left/motor_state comes from /driver and /forgotten at once: end one of them"
+BOTH = "/left/motor_state comes from /driver and /forgotten at once; end one of them"
 
 
 class Driver(DomainNode):
@@ -43,7 +44,7 @@ class Driver(DomainNode):
 
 
 class Robot:
-    """A driver, perhaps a forgotten one, and what the nodes say."""
+    """A driver, perhaps a forgotten one, and the nodes' diagnostics."""
 
     def __init__(self, domain: int) -> None:
         self.driver = Driver(domain, "driver", 1.0)
@@ -153,7 +154,7 @@ def test_states_without_a_stamp_are_named_and_refused_by_tools(
     process("identifier", *names("wheels:=[left]", "period:=0.5"))
     for name in ("left/wheel_pid", "skid_steer"):
         eventually(lambda name=name: "no stamp" in robot.said.get(name, ""), 20.0, robot.run)
-    # Its arrival stands for it: the wheel is driven, and heard.
+    # The arrival replaces the stamp: the wheel is driven, and its feedback used.
     eventually(lambda: robot.voltages and robot.voltages[-1] > 0.0, 20.0, robot.run)
     assert "no feedback" not in robot.said["skid_steer"]
     with RobotClient(name="tool") as client:
@@ -164,19 +165,19 @@ def test_states_without_a_stamp_are_named_and_refused_by_tools(
 
 def test_numbers_that_fall_once_are_of_a_publisher_that_was_started_anew() -> None:
     watch = PublisherWatch()
-    for start in range(FALLS - 1):
+    for start in range(DECISIVE_FALLS - 1):
         assert watch.hear({"publication_sequence_number": 1}) is bool(start)
         for k in range(2, 50):
             assert not watch.hear({"publication_sequence_number": k})
-    assert not watch.doubled
+    assert not watch.has_two_publishers
     for k in range(50, 60):
         watch.hear({"publication_sequence_number": k})
         watch.hear({"publication_sequence_number": k})
-    assert watch.doubled
+    assert watch.has_two_publishers
 
 
 def test_a_middleware_without_numbers_tells_nothing() -> None:
     watch = PublisherWatch()
     for _ in range(100):
         assert not watch.hear({"publication_sequence_number": None})
-    assert not watch.doubled
+    assert not watch.has_two_publishers

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """wheel_pid as its own process, fed by the test sample by sample."""
 
 from __future__ import annotations
@@ -125,7 +126,7 @@ def test_feedback_that_is_duplicated_old_or_nonsense_is_left_out_and_named(
     robot.spin_for(0.2)
     assert len(feed.commands) == answers
     assert feed.sample(0.5) == pytest.approx(1.0)
-    for words in ("duplicate", "older than the one before", "feedback velocity"):
+    for words in ("duplicate", "out of order", "feedback velocity"):
         eventually(lambda words=words: robot.named(NODE, words), 3.0, robot.spin, words)
     extreme = dict(voltage=math.nan, current=math.inf, position=-math.inf, duty_cycle=math.nan)
     assert feed.sample(0.5, encoder_count=-(2**63), **extreme) == pytest.approx(1.0)
@@ -238,7 +239,7 @@ def test_stall_runaway_and_over_current_switch_the_motor_off(start, robot, event
 
 def test_wheel_without_a_name_and_parameters_that_make_no_sense_are_refused(process):
     for given, words in (
-        ([], "needs joint_name"),
+        ([], "joint_name is empty"),
         (["-p", "i:=-100.0", "-r", "__ns:=/front_left"], "i is -100; it must be in [0,"),
         (["-p", "i_clamp_max:=-1.0", "-r", "__ns:=/front_left"], "i_clamp_m"),
     ):
@@ -249,7 +250,7 @@ def test_wheel_without_a_name_and_parameters_that_make_no_sense_are_refused(proc
 
 def test_unknown_parameter_and_missing_gains_are_warned_of(start, eventually):
     node = start("max_velocty:=1.0")
-    eventually(lambda: "no gains were given: p is 1 V s/rad" in node.output, 5.0)
+    eventually(lambda: "default gains: p is 1 V s/rad" in node.output, 5.0)
     words = "unknown parameter 'max_velocty' is ignored; did you mean 'max_velocity'?"
     eventually(lambda: words in node.output, 5.0)
 
@@ -302,4 +303,4 @@ def test_priority_and_processor_hold_for_all_threads_or_their_refusal_is_told(
 def test_processor_that_is_not_there_is_told_and_done_without(start, robot, eventually):
     start("cpu_affinity:=[4000]")
     settle(robot, Feed(robot, eventually))
-    eventually(lambda: robot.named(NODE, "cpu_affinity [4000] not granted"), 3.0, robot.spin)
+    eventually(lambda: robot.named(NODE, "cpu_affinity [4000] is not granted"), 3.0, robot.spin)

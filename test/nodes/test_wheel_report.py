@@ -1,4 +1,5 @@
-"""What wheel_pid says of itself, without a process."""
+# SPDX-License-Identifier: Apache-2.0
+"""Diagnostics of wheel_pid, without a process."""
 
 from __future__ import annotations
 
@@ -36,21 +37,21 @@ def said(monkeypatch):
     return ask
 
 
-def test_a_wheel_on_default_gains_says_so_in_log_and_diagnostics(said):
+def test_default_gains_are_reported_in_log_and_diagnostics(said):
     log, level, message = said(PidGains())
-    assert log == [wheel_report.UNTUNED]
-    assert wheel_report.UNTUNED in message
+    assert log == [wheel_report.UNTUNED_TEXT]
+    assert wheel_report.UNTUNED_TEXT in message
     assert level == runtime.OK  # nothing is wrong as long as it rests
 
 
-def test_a_wheel_with_gains_says_nothing_of_them(said):
+def test_given_gains_are_not_reported(said):
     log, _, message = said(PidGains(p=2.0, i=30.0))
     assert log == []
     assert "gains" not in message
     assert "defaults" not in message
 
 
-def test_feedback_that_is_slower_than_its_time_out_is_named_with_both(said):
+def test_feedback_slower_than_its_time_out_is_reported_with_both(said):
     def feed(wheel: WheelController) -> None:
         wheel.activate(100.0)
         for k in range(1, 5):
@@ -61,12 +62,12 @@ def test_feedback_that_is_slower_than_its_time_out_is_named_with_both(said):
 
     _, level, message = said(PidGains(p=2.0), feed)
     assert level == runtime.ERROR
-    assert "came 0.25 s after the one before, and feedback_timeout is 0.2 s" in message
+    assert "came 0.25 s after the previous one, and feedback_timeout is 0.2 s" in message
     _, _, message = said(PidGains(p=2.0), lambda wheel: wheel.activate(0.0) or wheel.tick(9.0))
     assert message.startswith("no feedback: 0 V") and "feedback_timeout" not in message
 
 
-def test_a_swing_is_named_with_advice(said):
+def test_an_oscillation_is_reported_with_advice(said):
     def swing(wheel: WheelController) -> None:
         wheel.activate(100.0)
         for k in range(1, 401):
@@ -78,5 +79,5 @@ def test_a_swing_is_named_with_advice(said):
 
     _, level, message = said(PidGains(p=2.0), swing)
     assert level == runtime.WARN
-    assert "swings by 0.88 rad/s around 1.5 rad/s at 6.3 Hz" in message
-    assert "feedback at 50 Hz; halve p, i and d, or design them by tune --rate 50" in message
+    assert "oscillates by 0.88 rad/s around 1.5 rad/s at 6.3 Hz" in message
+    assert "feedback at 50 Hz; halve p, i and d, or design them with tune --rate 50" in message

@@ -1,4 +1,5 @@
-"""What a tape of a test of wheels tells of their driver."""
+# SPDX-License-Identifier: Apache-2.0
+"""Evaluation of the samples of a wheel test."""
 
 from __future__ import annotations
 
@@ -6,14 +7,14 @@ import math
 
 import pytest
 
-from smp_motor_control.nodes.wheel_test import Tape
+from smp_motor_control.nodes.wheel_test import WheelRecording
 
 
-def tape(position) -> Tape:
+def recording(position) -> WheelRecording:
     """A wheel at 2 rad/s for 8 s, whose driver makes positions of its angle."""
     rows = [(1e4 + t, 0.0, 3.0, 3.0, 2.0, position(2.0 * t), 0.0, 1.0)
             for t in (0.01 * k for k in range(800))]  # fmt: skip
-    return Tape(rows)
+    return WheelRecording(rows)
 
 
 @pytest.mark.parametrize(
@@ -28,9 +29,9 @@ def tape(position) -> Tape:
     ],
 )
 def test_a_position_that_no_odometry_can_use_is_named(position, words: str) -> None:
-    said = tape(position).position_problem()
+    said = recording(position).position_problem()
     assert words in said and bool(words) is bool(said)
 
 
-def test_an_empty_tape_tells_nothing() -> None:
-    assert Tape().position_problem() == ""
+def test_an_empty_recording_has_no_problem() -> None:
+    assert WheelRecording().position_problem() == ""

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """tune --apply on four running wheels: real nodes, real plant, over DDS."""
 
 from __future__ import annotations
@@ -28,13 +29,13 @@ PERIOD = 1 / 200
 """Of the plant's samples [s]."""
 
 SPEED = 1.2
-"""Set-point of the wheels [rad/s], well within what the slowest of them reaches."""
+"""Set-point of the wheels [rad/s], well within reach of the slowest."""
 
 
 class Robot:
-    """Drives the running wheels at one speed and remembers what they did.
+    """Drive the running wheels at one speed and store their states.
 
-    It spins in a thread of its own, so that set-points never cease while a test waits.
+    It spins in its own thread, so set-points continue while a test waits.
     """
 
     def __init__(self) -> None:
@@ -108,8 +109,8 @@ def robot(process, eventually, tmp_path):
     gains = tmp_path / "start.yaml"
     tree = yaml.safe_load((ROOT / "config" / "gains.yaml").read_text())
     for node in tree.values():
-        # A machine that runs tests stands still for a moment at times: the voltage is held over it,
-        # so that a wheel that stops was stopped by what is tested.
+        # A machine that runs tests pauses at times: hold the voltage over a pause, so that only
+        # the tested code can stop a wheel.
         node["ros__parameters"].update(
             p=1.0, i=15.0, d=0.0, feedback_timeout=2.0, setpoint_timeout=2.0
         )
@@ -140,8 +141,8 @@ def run_tune(process, *arguments):
 
 
 def test_apply_changes_four_running_wheels_without_a_stop(process, robot, tmp_path):
-    # Designed first: what a busy processor does to the wheels meanwhile is not the change's doing.
-    # A machine that runs tests answers late at times: gains that bear 20 ms.
+    # Design first, so that the load of designing does not disturb the wheels during the change.
+    # A machine that runs tests responds late at times: design gains for 20 ms.
     gains = tmp_path / "good.yaml"
     options = ("--delay", "0.02", "--speed-source", "measured", "--output", gains)
     code, output = run_tune(process, MOTORS, *options)
@@ -172,9 +173,9 @@ def test_bad_gains_are_taken_back_within_two_seconds(process, robot, eventually,
         gains.write_text(yaml.safe_dump(tree))
         code, output = run_tune(process, "--gains", gains, "--apply")
         assert code == 1, output
-        taken = output[output.index("taken back after") :].split()
-        print(f"taken back after {taken[3]} s")  # for those who want to know how fast
-        assert float(taken[3]) < 2.0
+        taken = output[output.index("restored the old gains after") :].split()
+        print(f"restored after {taken[5]} s")
+        assert float(taken[5]) < 2.0
         for wheel in WHEELS:
             assert robot.gain(wheel, "p") == 1.0
             assert robot.gain(wheel, "i") == 15.0
@@ -212,7 +213,7 @@ def test_a_killed_tool_leaves_the_gains_as_they_were(process, robot, eventually,
         eventually(lambda wheel=wheel: robot.gain(wheel) == 1.0, deadline=10.0, message=wheel)
 
 
-def test_apply_without_running_wheels_says_so(process, ros_domain):
+def test_apply_without_running_wheels_is_refused(process, ros_domain):
     code, output = run_tune(process, "--gains", ROOT / "config" / "gains.yaml", "--apply")
     assert code == 1
     assert "is wheel_pid running?" in output
@@ -228,15 +229,15 @@ def period_with(motor, delay: float) -> float:
 
 def test_relay_on_a_running_wheel_gives_gains_without_a_model(process, robot, eventually, tmp_path):
     output = tmp_path / "relay.yaml"
-    # Twenty seconds hold enough cycles between the moments at which a busy machine stands still.
+    # Twenty seconds hold enough cycles between the pauses of a busy machine.
     options = ("--supply", "12", "--relay-seconds", "20", "--output", output)
     code, said = run_tune(process, "--relay", "rear_right", *options)
     assert code == 0, said
     gains = yaml.safe_load(output.read_text())["/**/rear_right/wheel_pid"]["ros__parameters"]
     share, integral, _ = RULES["tyreus_luyben", "pi"]
     ultimate, period = gains["p"] / share, gains["p"] / gains["i"] / integral
-    # Whatever a busy machine adds to the delay moves the period, and the ultimate gain with it: it
-    # is what the motor's own response says at that period. One part in ten is for the counts:
+    # Additional delay on a busy machine changes the period, and the ultimate gain with it: compare
+    # with the motor's own response at that period. One part in ten is for the counts:
     # 2.5 rad/s of quantum on an amplitude of some 20 rad/s, over dozens of cycles.
     motor = load_motors(MOTORS)["rear_right"]
     m, w = motor.parameters, 2j * math.pi / period

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The guards of `make check` that look at what is tracked."""
 
 from __future__ import annotations

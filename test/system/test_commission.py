@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """commission on a robot that runs, as its user runs it."""
 
 from __future__ import annotations
@@ -32,7 +33,7 @@ BUSY = (
     "feedback_rate", "feedback_age", "unreliable_identification", "validation_run",
     "verification", "verification_disturbed",
 )  # fmt: skip
-"""What the machine that simulates may show beside the robot, when it is busy elsewhere."""
+"""Findings that a busy machine may cause."""
 
 
 def test_it_checks_identifies_tunes_and_drives_the_running_robot(
@@ -73,7 +74,7 @@ def test_it_checks_identifies_tunes_and_drives_the_running_robot(
     assert robot.velocity("front_left") == pytest.approx(1.0, abs=0.1)
 
 
-def test_gains_drive_on_a_controller_of_its_own_where_none_runs(
+def test_gains_are_driven_on_a_new_controller_if_none_runs(
     process: Process, robot: WheelRobot, eventually: Callable[..., None], tmp_path: Path
 ) -> None:
     namespace = ("--ros-args", "-r", "__ns:=/robot1")

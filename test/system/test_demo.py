@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The demo as its user runs it: once to the end, and ended half-way in three ways."""
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ from smp_motor_ident.cli.applying import from_file
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "tutorial" / "simulated-robot.md"
 
 LIMIT = 150.0
-"""What the demo may take [s] on two cores that are its own."""
+"""Longest time of the demo [s] on two free cores."""
 
 
 def alive(mark: str) -> list[int]:

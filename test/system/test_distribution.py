@@ -1,4 +1,5 @@
-"""What pip and colcon install is what the repository holds."""
+# SPDX-License-Identifier: Apache-2.0
+"""pip and colcon install all files of the repository's packages."""
 
 from __future__ import annotations
 

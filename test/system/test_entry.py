@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Ctrl-C in the first second: while an executable is still importing."""
 
 from __future__ import annotations
@@ -38,7 +39,7 @@ def test_ctrl_c_while_importing_ends_an_executable_without_a_traceback(
     )
     assert started.returncode is None, started.output
     started.interrupt()
-    # A tool may have come as far as its file, which is not there.
+    # A tool may already have looked for its file, which is missing.
     assert started.wait(5.0) in (code, 2 if code else 0)
     assert "Traceback" not in started.output
 
@@ -73,7 +74,7 @@ def test_linear_algebra_stays_on_one_thread():
     assert threads("import smp_motor_control.entry") == 1
 
 
-def test_a_package_that_is_not_installed_is_named_with_what_to_type(process, tmp_path):
+def test_a_missing_package_is_named_with_the_command_to_install_it(process, tmp_path):
     (tmp_path / "numba.py").write_text("raise ModuleNotFoundError(name='numba')\n")
     for executable in ("identify", "tune", "identifier"):
         path = os.pathsep.join([str(tmp_path), os.environ.get("PYTHONPATH", "")])
@@ -83,13 +84,13 @@ def test_a_package_that_is_not_installed_is_named_with_what_to_type(process, tmp
         assert "Traceback" not in started.output
 
 
-def test_pip_is_told_to_install_beside_the_packages_of_the_system(monkeypatch, tmp_path):
+def test_pip_gets_break_system_packages_in_a_managed_environment(monkeypatch, tmp_path):
     monkeypatch.setattr("sysconfig.get_path", lambda name: str(tmp_path))
     absent = ModuleNotFoundError(name="mcap")
     monkeypatch.setattr(sys, "prefix", sys.base_prefix)
-    assert entry.missing(absent).endswith("pip install mcap")
+    assert entry.explain_missing_module(absent).endswith("pip install mcap")
     (tmp_path / "EXTERNALLY-MANAGED").touch()
-    assert entry.missing(absent).endswith("pip install --break-system-packages mcap")
+    assert entry.explain_missing_module(absent).endswith("pip install --break-system-packages mcap")
 
 
 @pytest.mark.parametrize("executable", ["wheel_pid", "skid_steer", "excite", "identifier", "play"])
@@ -100,7 +101,7 @@ def test_every_node_has_help(process, executable):
 
 
 def test_ctrl_c_that_a_compiled_module_turns_into_an_import_error_is_ctrl_c(monkeypatch):
-    def interrupted(module: str) -> None:
+    def was_interrupted_on_import(module: str) -> None:
         try:
             try:
                 raise KeyboardInterrupt
@@ -109,16 +110,16 @@ def test_ctrl_c_that_a_compiled_module_turns_into_an_import_error_is_ctrl_c(monk
         except ImportError:
             raise ImportError(f"the C extension of {module} is not present")  # noqa: B904
 
-    monkeypatch.setattr(entry.importlib, "import_module", interrupted)
-    assert entry._program("smp_motor_control.nodes.wheel_pid", 0)() == 0
-    assert entry._program("smp_motor_ident.cli.tune", 130)() == 130
+    monkeypatch.setattr(entry.importlib, "import_module", was_interrupted_on_import)
+    assert entry._make_program("smp_motor_control.nodes.wheel_pid", 0)() == 0
+    assert entry._make_program("smp_motor_ident.cli.tune", 130)() == 130
 
     def broken(module: str) -> None:
         raise ImportError("undefined symbol")
 
     monkeypatch.setattr(entry.importlib, "import_module", broken)
     with pytest.raises(ImportError, match="undefined symbol"):
-        entry._program("smp_motor_control.nodes.wheel_pid", 0)()
+        entry._make_program("smp_motor_control.nodes.wheel_pid", 0)()
 
 
 def test_ctrl_c_that_python_drops_while_importing_ends_a_node(process, tmp_path):
@@ -136,4 +137,4 @@ def test_ctrl_c_that_python_drops_while_importing_ends_a_node(process, tmp_path)
     path = os.pathsep.join([str(tmp_path), os.environ["PYTHONPATH"]])
     started = process("skid_steer", "--ros-args", env={"PYTHONPATH": path})
     assert started.wait(30.0) == 0
-    assert "KeyboardInterrupt" in started.output  # Python's word on what it ignored
+    assert "KeyboardInterrupt" in started.output  # Python's report of ignored exceptions

@@ -1,4 +1,5 @@
-"""Fault campaign: plant, wheels and skid_steer as processes, and everything that goes wrong.
+# SPDX-License-Identifier: Apache-2.0
+"""Fault campaign: plant, wheels and skid_steer as processes, with injected faults.
 
 No node may die, no wheel may turn when it should not, every fault is named on /diagnostics
 within its time-out, and driving resumes without a restart.
@@ -89,7 +90,7 @@ class Campaign:
         self.drives()
 
     def stops(self, within: float = TIMEOUT) -> None:
-        """Wait until the wheel stands still."""
+        """Wait until the wheel has stopped."""
         self.eventually(
             lambda: abs(true_speed(self.robot)) < 0.03,
             within + 1.0,
@@ -177,7 +178,7 @@ def test_set_points_that_cease_are_nonsense_or_stale_stop_the_wheel(process, rob
         robot.setpoints.publish(stale)
         robot.spin_for(0.02)
     assert abs(true_speed(robot)) < 0.03
-    campaign.names("out of date", since)
+    campaign.names("set-point older than its time-out", since)
     robot.setpoint = SPEED
     campaign.drives()
 
@@ -221,7 +222,7 @@ def test_ten_thousand_malformed_and_extreme_messages_kill_nothing(process, robot
         elif kind == 2:
             command.publish(MotorCommand(voltage=draw.choice([math.nan, math.inf, -math.inf])))
         else:
-            # A well-formed envelope around bytes that are no message.
+            # A well-formed header followed by random bytes
             size = draw.randrange(0, 60)
             raw.publish(struct.pack("<I", 256) + draw.randbytes(size))
         if k % 50 == 0:

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The launch file, where a ROS with launch is sourced."""
 
 from __future__ import annotations
@@ -9,7 +10,7 @@ import pytest
 
 from smp_motor_control import WHEELS
 from smp_motor_control.errors import ParameterError
-from smp_motor_control.parameter_file import parameters_of, require_nodes
+from smp_motor_control.parameter_file import read_node_parameters, require_nodes
 
 LAUNCH = Path(__file__).parents[2] / "launch" / "smp.launch.py"
 
@@ -27,7 +28,7 @@ def test_launch_file_starts_plant_wheels_and_body_of_any_robot(tmp_path):
     context = LaunchContext()
     for entity in module.generate_launch_description().entities[:-1]:
         entity.execute(context)
-    started = module.start(context)  # a remark beside the nodes where no URDF is published
+    started = module.start(context)  # plus a remark where no URDF is published
     executables = [one.node_executable for one in started if isinstance(one, Node)]
     assert executables.count("wheel_pid") == 4
     assert {"motor_plant", "skid_steer"} <= set(executables)
@@ -45,7 +46,7 @@ def test_launch_file_starts_plant_wheels_and_body_of_any_robot(tmp_path):
     with pytest.raises(ParameterError, match="named twice: left"):
         module.start(context)
     context.launch_configurations["left_wheels"] = "unknown"
-    with pytest.raises(ParameterError, match="says nothing to /unknown/wheel_pid"):
+    with pytest.raises(ParameterError, match="has no parameters for /unknown/wheel_pid"):
         module.start(context)
 
 
@@ -53,7 +54,7 @@ def test_parameter_file_speaks_to_the_nodes_of_every_robot(tmp_path):
     gains = LAUNCH.parents[1] / "config" / "gains.yaml"
     require_nodes(gains, [f"/{wheel}/wheel_pid" for wheel in WHEELS])
     require_nodes(gains, [f"/a/b/{wheel}/wheel_pid" for wheel in WHEELS])
-    with pytest.raises(ParameterError, match="says nothing to /front_left/motor_plant"):
+    with pytest.raises(ParameterError, match="has no parameters for /front_left/motor_plant"):
         require_nodes(gains, ["/front_left/motor_plant"])
     with pytest.raises(ParameterError, match="cannot be read"):
         require_nodes(tmp_path / "none.yaml", [])
@@ -66,7 +67,7 @@ def test_parameters_of_a_node_are_those_of_any_namespace(tmp_path):
         "/robot1/skid_steer: {ros__parameters: {left_wheel_names: [left]}}\n"
         "/**/excite: {ros__parameters: {wheel_names: [left, right]}}\n"
     )
-    found = parameters_of(file, "skid_steer")
+    found = read_node_parameters(file, "skid_steer")
     assert found == {"use_sim_time": True, "left_wheel_names": ["left"]}
 
 

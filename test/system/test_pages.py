@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The pages' ``sh`` blocks for a running robot, as they are printed, on the simulated one.
 
 They take minutes, so they run on request: ``make test ARGS="-m long"``. Lines of ``ros2`` run
@@ -83,7 +84,7 @@ def robots(ros_domain, process, eventually, tmp_path):
         motors, gains = two_wheeled(tmp_path) if wheels == TWO else four
         sides = (("left", wheels[::2]), ("right", wheels[1::2]))
         named = [f"{side}_wheel_names:=[{', '.join(names)}]" for side, names in sides]
-        # What a page says holds at any rate; half of the usual one leaves a small machine its time.
+        # A page's commands work at any rate; half of the usual one suits a small machine.
         rate = ("-p", "rate:=100.0")
         running.append(process("motor_plant", *place, "-p", f"motors_file:={motors}", *rate))
         if body:
@@ -116,7 +117,7 @@ def robots(ros_domain, process, eventually, tmp_path):
 
 @pytest.mark.long
 @pytest.mark.parametrize(("page", "lines"), printed())
-def test_commands_for_a_running_robot_do_what_their_page_says(page, lines, tmp_path, robots):
+def test_commands_for_a_running_robot_work_as_their_page_describes(page, lines, tmp_path, robots):
     write_bag(tmp_path / "my_bag", motion(1), own=True, current=True)
     answered = identify.main([str(tmp_path / "my_bag"), "--output", str(tmp_path / "result"), "-q"])
     assert answered == 0

@@ -1,4 +1,5 @@
-"""The fixtures that the system tests stand on."""
+# SPDX-License-Identifier: Apache-2.0
+"""The fixtures of the system tests."""
 
 from __future__ import annotations
 

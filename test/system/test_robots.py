@@ -1,4 +1,5 @@
-"""Robots side by side: every executable in the robot's namespace, wheels one level below."""
+# SPDX-License-Identifier: Apache-2.0
+"""Several robots: every executable in the robot's namespace, wheels one level below."""
 
 from __future__ import annotations
 

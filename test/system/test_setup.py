@@ -1,4 +1,5 @@
-"""The set-up: one clear line when something is missing, redone only when its inputs change."""
+# SPDX-License-Identifier: Apache-2.0
+"""The set-up reports missing parts in one line, and repeats only if its inputs change."""
 
 from __future__ import annotations
 
@@ -22,7 +23,7 @@ BASE = str(getattr(sys, "_base_executable", sys.executable))
 # The ROS of the shell that runs the tests, if there is one.
 OF_ROS = ("ROS_DISTRO", "AMENT_PREFIX_PATH", "PYTHONPATH", "LD_LIBRARY_PATH")
 ROS = {name: os.environ[name] for name in OF_ROS if name in os.environ}
-# What the script itself calls, and none of the tools that it has to find.
+# Commands that the script itself calls, without the tools that it has to find.
 SHELL_TOOLS = ("sh", "bash", "dirname", "uname", "env")
 
 
@@ -73,7 +74,7 @@ def assert_refused(result, clone, *words):
     assert not (clone / ".venv" / "ready").exists()
 
 
-def test_missing_python_says_what_to_install(clone, machine):
+def test_missing_python_is_reported_with_the_package_to_install(clone, machine):
     assert_refused(run(clone, machine), clone, "no Python 3.10 to 3.13", "apt install python3")
 
 
@@ -160,7 +161,7 @@ def test_second_set_up_waits_for_the_first(clone, process, eventually):
         second = process("scripts/setup.sh", cwd=clone, env=no_ros)
         eventually(lambda: "waiting" in second.output)
         assert second.returncode is None
-    # Let in, it goes on to what is wrong with this machine: no ROS where one is said to be.
+    # Once admitted, it reports the fault of this machine: ROS is missing from the given place.
     assert second.wait(30.0) == 1
 
 
@@ -176,7 +177,7 @@ def test_set_up_that_is_done_has_nothing_to_say(ready):
         result = run(ROOT, os.environ["PATH"], **ROS)
         elapsed = time.monotonic() - started
     assert (result.returncode, result.stdout, result.stderr) == (0, "", "")
-    assert elapsed < 3.0  # what a second `make test` may take before it begins to test
+    assert elapsed < 3.0  # longest start of a second `make test`
 
 
 def test_shell_from_another_folder_finds_the_executables_and_the_messages(ready, tmp_path):
@@ -194,7 +195,7 @@ def test_shell_leaves_discovery_to_its_user(ready, tmp_path):
     assert run(tmp_path, "/usr/bin:/bin", command=("bash", "-c", script)).stdout == "0\n"
 
 
-def test_pytest_works_beside_the_plugin_of_a_sourced_launch_testing(tmp_path):
+def test_pytest_works_with_a_sourced_launch_testing_plugin(tmp_path):
     # Its hook takes an argument that pytest 9 no longer gives.
     (tmp_path / "older.py").write_text("def pytest_pycollect_makemodule(path, parent): ...\n")
     package = tmp_path / "launch_testing-3.4.3.dist-info"
@@ -208,7 +209,7 @@ def test_pytest_works_beside_the_plugin_of_a_sourced_launch_testing(tmp_path):
     assert ran.returncode == 0, ran.stdout + ran.stderr
 
 
-def test_the_root_package_names_what_the_one_below_it_needs():
+def test_the_root_package_declares_the_dependencies_of_the_inner_one():
     """Where rosdep finds a package.xml, it looks no further down."""
 
     def keys(path: str) -> set[str]:

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Recordings made by libraries other than the reader under test: rosbags, mcap, sqlite3."""
 
 from __future__ import annotations
@@ -64,7 +65,7 @@ def header(nanoseconds: int, frame: str = "") -> Any:
 
 @dataclass(frozen=True)
 class Motion:
-    """What one motor did, and its messages."""
+    """Motion of one motor, and its messages."""
 
     wheel: str
     time: np.ndarray
@@ -274,7 +275,7 @@ def write_metadata(
 
 
 def assert_read(record: Any, truth: Motion, n: int | None = None) -> None:
-    """Assert that a record is what a motion was (its first ``n`` samples)."""
+    """Assert that a record equals a motion (its first ``n`` samples)."""
     n = truth.time.size if n is None else n
     assert len(record) == n
     # Nanoseconds become float64 seconds: exact to half a unit in the last place.

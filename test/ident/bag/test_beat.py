@@ -1,4 +1,5 @@
-"""Arrival times put back on the beat of a regular sender; honest times left as they are."""
+# SPDX-License-Identifier: Apache-2.0
+"""Arrival times are fitted to the period of a regular sender; other times are unchanged."""
 
 from __future__ import annotations
 
@@ -10,8 +11,8 @@ import pytest
 from independent import simulate
 
 from smp_motor_ident.bag import read_records
-from smp_motor_ident.diagnosis.stamps import find_beat, on_beat
 from smp_motor_ident.estimate import estimate
+from smp_motor_ident.quality.stamps import find_beat, on_beat
 from smp_motor_ident.record import Hardware, Record
 
 T = 10_000_000  # ns
@@ -51,7 +52,7 @@ def test_few_lost_samples_leave_the_beat_where_it_is() -> None:
     kept = np.sort(rng.choice(true.size, 3980, replace=False))
     beat = find_beat(np.rint(late[kept]).astype(np.int64))
     assert beat is not None
-    # A loss is placed within a few samples: beside it the number of a sample is off by one.
+    # A loss is located within a few samples; between the two places the index is off by one.
     assert np.median(np.abs(beat.time - true[kept])) < 0.05 * T
     assert np.std(beat.time - true[kept]) < np.std(late[kept] - true[kept])
 
@@ -143,7 +144,7 @@ def test_a_regular_time_that_was_only_rounded_is_put_back_whatever_the_motion_sh
 
 
 def _stalled(seed: int, sampled_late: bool) -> Record:
-    """Return a record of a machine that stood still now and then: in its stamps, or its samples."""
+    """Return a record of a machine with pauses, in its stamps or in its samples."""
     rng = np.random.default_rng(seed)
     beat = 5e-3 * np.arange(1600)
     stamp = beat + 1e-4 * rng.random(beat.size)

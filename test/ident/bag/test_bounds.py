@@ -1,4 +1,5 @@
-"""What spoilt and hostile files may cost: bounded memory, one line, no traceback."""
+# SPDX-License-Identifier: Apache-2.0
+"""Damaged and hostile files: bounded memory, one line, no traceback."""
 
 from __future__ import annotations
 
@@ -68,7 +69,7 @@ def test_a_message_that_quotes_a_spoilt_value_keeps_head_and_tail() -> None:
     assert str(BagError("a.yaml: " + 900 * "x")) == "a.yaml: " + 900 * "x"
 
 
-def test_a_file_of_which_the_reader_of_matlab_dies_is_refused(
+def test_a_file_that_kills_the_matlab_reader_is_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path = tmp_path / "a.mat"

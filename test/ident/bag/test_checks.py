@@ -1,4 +1,5 @@
-"""Signals that cannot be what they are said to be."""
+# SPDX-License-Identifier: Apache-2.0
+"""Detection of signals that contradict their mapping."""
 
 from __future__ import annotations
 
@@ -48,7 +49,7 @@ def test_values_that_jump_impossibly_are_left_out(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("shape", ["pulses", "steps", "quantised", "rest"])
-def test_nothing_is_left_out_of_what_motors_do(tmp_path: Path, shape: str) -> None:
+def test_no_sample_of_a_real_motion_is_left_out(tmp_path: Path, shape: str) -> None:
     voltage, speed = U.copy(), motion()
     if shape == "pulses":
         voltage = np.where(np.arange(N) % 50 == 0, 12.0, 0.0)
@@ -86,7 +87,7 @@ def test_a_count_that_jumps_impossibly_is_left_out_with_its_sample(
 
 def test_a_counter_that_turns_to_and_fro_where_it_wraps_loses_no_sample(tmp_path: Path) -> None:
     to_and_fro = np.rint(30 * np.sin(0.4 * np.arange(N))).astype(np.int64)
-    to_and_fro[: N // 2] = 1000  # most of its steps are none
+    to_and_fro[: N // 2] = 1000  # most of its steps are zero
     record = read_count(tmp_path / "log.csv", to_and_fro % (1 << 16), 16)
     assert "impossible_jump" not in codes(record)
     assert record.count is not None and record.count.size == N
@@ -131,7 +132,7 @@ def test_a_direction_may_be_written_in_words(tmp_path: Path, codes_of: tuple[str
     np.testing.assert_allclose(record["motor"].voltage[1:], U[:-1], rtol=1e-12)
 
 
-@pytest.mark.parametrize("still", [0, 1])  # a code for standing still beside the two ways
+@pytest.mark.parametrize("still", [0, 1])  # a third code for standstill
 def test_codes_of_a_direction_that_are_no_signs_are_questioned(tmp_path: Path, still: int) -> None:
     volts = U * (np.arange(N) % 40 >= 20 * still)
     direction = np.select([volts > 0, volts < 0], [1, 2], 0)
@@ -160,7 +161,7 @@ def test_a_driver_puts_out_no_more_than_its_supply(tmp_path):
     path.write_text("\n".join(["t,pwm,w", *rows]))
     mapping = "time=t voltage=pwm:pwm velocity=w pwm_full_scale=255 supply_voltage=12 held=after"
     record = read_records(path, [mapping])["motor"]
-    # What is held from a row on has its place before the next: the same values, one row later.
+    # A value held from its row on is the mean of the interval that ends one row later.
     np.testing.assert_allclose(record.voltage[1:], np.clip(pwm / 255 * 12, -12, 12)[:-1])
     (found,) = (f for f in record.findings if f.code == "beyond_full_scale")
     assert found.evidence["samples"] == 10

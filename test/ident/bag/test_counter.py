@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Counters that wrap, of every width, and counters that start again: by the test's own counting."""
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ def turning(samples: int = 400, most: int = 90, seed: int = 3) -> np.ndarray:
 
 
 def shown(count: np.ndarray, bits: int) -> np.ndarray:
-    """What a two's complement counter of that width shows: -2^(bits-1) to 2^(bits-1) - 1."""
+    """Return the readings of a two's complement counter: -2^(bits-1) to 2^(bits-1) - 1."""
     half = 2 ** (bits - 1)
     return (count + half) % 2**bits - half
 
@@ -71,13 +72,13 @@ def test_a_width_of_zero_and_a_counter_that_never_jumps_stay_as_they_are() -> No
 
 
 @pytest.mark.parametrize("raw", [[], [7]])
-def test_a_counter_of_one_sample_is_what_it_is(raw: list[int]) -> None:
+def test_a_counter_of_one_sample_is_unchanged(raw: list[int]) -> None:
     found = unwrap(np.array(raw, np.int64), 16)
     assert found.count.tolist() == raw and found.resets.size == 0
     assert unwrap(np.array([5, 260]), 8).count.tolist() == [5, 4]
 
 
-def test_a_measured_speed_says_how_often_a_narrow_counter_went_round() -> None:
+def test_a_measured_speed_resolves_multiple_wraps_of_a_narrow_counter() -> None:
     steps = np.random.default_rng(1).integers(300, 500, 200)  # more than a turn of eight bits
     true = np.concatenate([[0], np.cumsum(steps)])
     expected = steps + np.random.default_rng(2).uniform(-100.0, 100.0, steps.size)
@@ -89,7 +90,7 @@ def test_a_measured_speed_says_how_often_a_narrow_counter_went_round() -> None:
 
 
 @pytest.mark.parametrize("measured", [True, False])
-def test_a_reset_is_no_motion_and_the_counts_before_and_after_stay(measured: bool) -> None:
+def test_a_reset_adds_no_motion_and_keeps_the_counts_around_it(measured: bool) -> None:
     true = turning(samples=400, most=20) + 50_000
     raw = true.copy()
     raw[120:] -= true[120]  # starts at zero again
@@ -123,10 +124,10 @@ def test_resets_by_the_dozen_are_no_resets() -> None:
 
 def test_an_angle_within_one_turn_is_unwrapped_and_any_other_left() -> None:
     true = 0.05 * turning(samples=500, most=9)
-    wrapped = np.angle(np.exp(1j * true))
-    gaps = wrapped.copy()
+    wrap_angle = np.angle(np.exp(1j * true))
+    gaps = wrap_angle.copy()
     gaps[[40, 41, 90]] = np.nan
-    for raw in (wrapped, gaps):
+    for raw in (wrap_angle, gaps):
         result, undone = unwrap_angle(raw)
         sound = np.isfinite(raw)
         # Angles of 2 pi and less, through a complex exponential: rounding alone.
@@ -140,7 +141,7 @@ def test_an_angle_within_one_turn_is_unwrapped_and_any_other_left() -> None:
 
 
 @pytest.mark.parametrize("measured", [True, False])
-def test_a_counter_that_wraps_starts_again_at_what_it_shows(measured: bool) -> None:
+def test_a_counter_is_unwrapped_at_the_width_found_in_its_data(measured: bool) -> None:
     true = turning(samples=600, most=90, seed=8) + 30_000  # it wraps before the first reset
     true[250:] -= true[250] - 5
     true[450:] += 15_000 - true[450]
@@ -173,7 +174,7 @@ def test_a_fall_at_either_end_is_a_wrong_sample_and_no_reset(at: int) -> None:
     assert found.resets.size == 0 and np.array_equal(found.count, raw)
 
 
-def test_a_spike_beside_zero_is_no_reset() -> None:
+def test_a_spike_near_zero_is_not_a_reset() -> None:
     raw = turning(samples=300, most=20) % 50
     raw[100] = 50_000
     assert unwrap(raw, 0).resets.size == 0
@@ -208,7 +209,7 @@ def test_a_narrow_counter_that_turns_as_fast_as_may_be_told_is_told() -> None:
 
 
 @pytest.mark.parametrize("measured", [True, False])
-def test_a_jump_that_is_no_width_and_ends_elsewhere_is_left(measured: bool) -> None:
+def test_a_jump_of_no_counter_width_is_kept(measured: bool) -> None:
     raw = turning(samples=300, most=20) + 50_000
     expected = np.diff(raw).astype(float) if measured else None
     raw[150:] += 5000
@@ -260,9 +261,9 @@ def test_a_counter_that_wraps_at_any_width_is_unwrapped(bits: int, seed: int, kn
     found = unwrap(raw, bits if known else None)
     np.testing.assert_array_equal(found.count - found.count[0], truth - truth[0])
     assert found.resets.size == 0
-    wrapped = bool((raw != truth - truth[0] + raw[0]).any())
+    wrap_angle = bool((raw != truth - truth[0] + raw[0]).any())
     if not known:
-        assert bool(found.findings) == wrapped
+        assert bool(found.findings) == wrap_angle
 
 
 @pytest.mark.parametrize("bits", [16, 32])
@@ -336,7 +337,7 @@ def test_an_angle_that_wraps_at_turns_or_a_part_of_one_is_unwrapped(turns: float
     assert result - result[0] == pytest.approx(true - true[0], abs=1e-8)
 
 
-def test_an_angle_that_is_thrown_to_and_fro_is_no_wrap() -> None:
+def test_an_angle_that_toggles_is_not_unwrapped() -> None:
     # A position loop that reaches its target in a sample, overshoots and settles.
     cycle = np.concatenate([np.zeros(20), [8.0, 7.3, 7.1], np.full(17, 7.0)])
     angle = np.tile(cycle, 10) + np.random.default_rng(7).normal(0, 0.01, 400)
@@ -409,7 +410,7 @@ def test_more_than_half_a_turn_a_sample_is_refused_as_aliasing(drive: str, lag: 
 
 
 @pytest.mark.parametrize("faults", [1, 2])
-def test_a_fault_of_a_fast_angle_is_no_aliasing(faults: int) -> None:
+def test_single_faults_of_a_fast_angle_are_not_aliasing(faults: int) -> None:
     angle = folded(0.9, 15.0, "levels")
     angle[[500, 900][:faults]] += 3.0
     assert unwrap_angle(np.mod(angle, 2 * np.pi))[1] == 2 * np.pi

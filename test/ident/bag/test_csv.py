@@ -1,4 +1,5 @@
-"""CSV files by the same mapping, whatever wrote them."""
+# SPDX-License-Identifier: Apache-2.0
+"""CSV files of different software with the same mapping."""
 
 from __future__ import annotations
 
@@ -152,7 +153,7 @@ def test_names_of_several_words_are_not_shifted(
 
 
 @pytest.mark.parametrize("between", ["T", " ", "_", "."])
-def test_a_time_of_day_is_no_label(tmp_path: Path, between: str) -> None:
+def test_a_time_of_day_is_not_a_label(tmp_path: Path, between: str) -> None:
     rows = [f"2024-05-06{between}12:00:0{k},{u},{y}" for k, (u, y) in enumerate(zip(U, Y))]
     (tmp_path / "log.csv").write_text("\n".join(["t,u,y", *rows]))
     record = read_records(tmp_path / "log.csv", MAP)["motor"]
@@ -239,7 +240,7 @@ def test_a_time_without_unit_that_cannot_be_seconds_is_asked_for(
 ) -> None:
     path = tmp_path / "log.csv"
     path.write_text("\n".join(["tiempo,u,y", *(f"{step * k},{k % 7},{k % 5}" for k in range(99))]))
-    with pytest.raises(BagError, match=f"rises by {step} a row.* time=tiempo:ms"):
+    with pytest.raises(BagError, match=f"rises by {step} per row.* time=tiempo:ms"):
         read_records(path, ["voltage=u velocity=y time=tiempo"])
     for told, factor in ((unit, 1e-3 if unit == "ms" else 1e-6), ("s", 1.0)):
         record = read_records(path, [f"voltage=u velocity=y time=tiempo:{told} gap=1e6"])["motor"]
@@ -257,7 +258,7 @@ def test_columns_of_words_are_not_in_the_way(tmp_path: Path) -> None:
     (offer,) = list_topics(path)[0].offers
     assert offer.fields == ["t", "u", "y"]
     assert len(read_records(path, ["voltage=u velocity=y time=t"])["motor"]) == len(rows)
-    with pytest.raises(BagError, match="line 2, column 'frame': \"'map'\" is no number"):
+    with pytest.raises(BagError, match="line 2, column 'frame': \"'map'\" is not a number"):
         read_records(path, ["voltage=frame velocity=y time=t"])
 
 
@@ -324,7 +325,7 @@ def test_a_column_goes_by_its_name_without_the_unit(tmp_path: Path) -> None:
         ("", MAP, "is empty"),
         ("0.0,1.0,2.0\n0.1,1.0,2.0\n", MAP, "it has c1, c2, c3"),
         ("t,u,y\n", MAP, "no rows"),
-        ("t,u,y\n0,1,2\n1,1,abc\n", MAP, "line 3, column 'y': 'abc' is no number"),
+        ("t,u,y\n0,1,2\n1,1,abc\n", MAP, "line 3, column 'y': 'abc' is not a number"),
         (table(), ["voltage=u velocity=speed time=t"], "no column 'speed'; it has t, u, y"),
         (table(), ["voltage=u velocity=y"], "which column is the time"),
         (table(), None, "needs a mapping, such as"),
@@ -332,7 +333,7 @@ def test_a_column_goes_by_its_name_without_the_unit(tmp_path: Path) -> None:
         ("\x00\xff\xfe", MAP, "log.csv"),
     ],
 )
-def test_what_cannot_be_read_is_refused_with_file_and_reason(
+def test_unreadable_files_are_refused_with_name_and_reason(
     tmp_path: Path, text: str, mapping: list[str] | None, reason: str
 ) -> None:
     path = tmp_path / "log.csv"
@@ -344,7 +345,9 @@ def test_what_cannot_be_read_is_refused_with_file_and_reason(
     assert "\n" not in str(refused.value)
 
 
-@pytest.mark.skipif(not DATA.exists(), reason="needs the recordings beside the repository")
+@pytest.mark.skipif(
+    not DATA.exists(), reason="needs the recordings of the repository's parent folder"
+)
 def test_the_recordings_of_real_motors_are_read() -> None:
     path = DATA / "prbs_gearmotor" / "prbs_2026-08-14.csv"
     record = read_records(path, MAP)["motor"]
@@ -361,7 +364,7 @@ def test_the_recordings_of_real_motors_are_read() -> None:
     ]
     records = read_experiments(steps, mapping)["motor"]
     assert len(records) == 10
-    # Duty cycles of about 30 to 75 % of 12 V, in ticks that are no round numbers.
+    # Duty cycles of about 30 to 75 % of 12 V, in odd numbers of ticks.
     highest = sorted(np.abs(record.voltage).max() / 12 for record in records)
     assert highest[0] == pytest.approx(0.3, abs=0.03)
     assert highest[-1] == pytest.approx(0.75, abs=0.03)
@@ -395,7 +398,7 @@ def test_shares_are_read_as_they_are_written(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("stamp", "reason"),
-    [("2262-05-01T00:00:00.{:03}", "is no number"), ("0", "all 5 rows have the same time, 0 s")],
+    [("2262-05-01T00:00:00.{:03}", "is not a number"), ("0", "all 5 rows have the same time, 0 s")],
 )
 def test_a_time_that_tells_nothing_is_named(tmp_path: Path, stamp: str, reason: str) -> None:
     rows = [f"{stamp.format(20 * k)},{u},{y}" for k, (u, y) in enumerate(zip(U, Y))]

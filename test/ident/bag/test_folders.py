@@ -1,4 +1,5 @@
-"""Folders of bags, and bags of several files: which are one recording, which are experiments."""
+# SPDX-License-Identifier: Apache-2.0
+"""Folders of bags, and bags of several files, as recordings or experiments."""
 
 from __future__ import annotations
 

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Every format a bag may come in, made by other libraries, reads as the same record."""
 
 from __future__ import annotations
@@ -165,7 +166,7 @@ def test_messages_that_only_the_journal_holds_are_read(
             (sent.stamp, sent.data),
         )
     database.commit()
-    # What a recorder that died leaves behind: the file and its journal, copied while open.
+    # A killed recorder leaves the file and its journal, copied here while open.
     dead = tmp_path / "dead"
     dead.mkdir()
     for name in ("bag.db3", "bag.db3-wal"):
@@ -182,7 +183,7 @@ def test_messages_that_only_the_journal_holds_are_read(
     assert (dead / "bag.db3").read_bytes() == before
 
 
-def test_a_message_that_changed_between_distributions_is_read_by_what_fits(
+def test_a_message_that_changed_between_distributions_is_read_by_the_fitting_definition(
     tmp_path: Path, corpus: SimpleNamespace
 ) -> None:
     # Range of Foxy has no field `variance`; the bag does not define it.
@@ -213,14 +214,14 @@ def test_a_message_that_changed_between_distributions_is_read_by_what_fits(
     [
         ("a.mcap", b"", "is empty"),
         ("a.mcap", b"\x89MCAP", "cut off"),
-        ("a.mcap", b"hello world, this is no bag", "no recording of a known format"),
+        ("a.mcap", b"hello world, this is no bag", "not a recording of a known format"),
         ("a.db3", b"SQLite format 3\0", "not a readable bag"),
         ("a.bag", b"#ROSBAG V1.2\n", "ROS 1 bag of version 'V1.2'"),
         ("a.db3.zstd", b"\x28\xb5\x2f\xfd\x00", "compression is cut off"),
         ("a.db3", b"SQLite format 3\0" + bytes(4080), "not a readable bag"),
     ],
 )
-def test_what_is_no_bag_is_refused_with_its_reason(
+def test_files_that_are_not_bags_are_refused_with_the_reason(
     tmp_path: Path, name: str, content: bytes, reason: str
 ) -> None:
     path = tmp_path / name
@@ -232,7 +233,7 @@ def test_what_is_no_bag_is_refused_with_its_reason(
 
 
 @pytest.mark.parametrize("storage", ["mcap", "db3"])
-def test_an_empty_bag_is_refused_with_what_it_lacks(
+def test_an_empty_bag_is_refused_with_the_missing_topics(
     tmp_path: Path, corpus: SimpleNamespace, storage: str
 ) -> None:
     write = corpus.write_mcap if storage == "mcap" else corpus.write_sqlite

@@ -1,4 +1,5 @@
-"""No file costs more than its size allows, whatever it claims: one line within 30 s and 1 GB."""
+# SPDX-License-Identifier: Apache-2.0
+"""Hostile files are refused in one line within 30 s and 1 GB."""
 
 from __future__ import annotations
 

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A voltage that is recorded after it acts is moved back; one that leads its motion is not."""
 
 from __future__ import annotations
@@ -49,12 +50,12 @@ def test_the_rows_that_a_command_is_late_are_found(drive: str, rows: int) -> Non
 @pytest.mark.parametrize("drive", [*DRIVES, "sine"])
 @pytest.mark.parametrize("winding", [0.0, 2.0])
 @pytest.mark.parametrize("lag", [2.0, 50.0])
-def test_a_command_in_time_is_none(drive: str, lag: float, winding: float) -> None:
+def test_a_punctual_command_is_not_moved(drive: str, lag: float, winding: float) -> None:
     voltage = DRIVES.get(drive, 6 * np.sin(np.arange(N) * 2 * np.pi / 150))
     assert rows_behind(voltage, noisy(turned(voltage, lag, winding))) == 0
 
 
-def test_noise_that_a_loop_feeds_back_is_none() -> None:
+def test_noise_fed_back_by_a_loop_does_not_move_the_command() -> None:
     target, speed, rows = np.repeat(RNG.uniform(-100, 100, N // 50), 50), 0.0, []
     for k in range(N):
         measured = speed + RNG.normal(0, 3)

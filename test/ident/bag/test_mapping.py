@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The mapping's grammar, on the command line and in YAML."""
 
 from __future__ import annotations
@@ -82,8 +83,8 @@ def test_the_same_is_written_in_yaml_and_on_the_command_line(tmp_path: Path) -> 
     [
         ("voltage", "write KEY=VALUE"),
         ("voltage=", "write KEY=VALUE"),
-        ("volts=/a.b", "no key of a mapping; use voltage"),
-        ("left.volts=/a.b", "no key of a mapping"),
+        ("volts=/a.b", "not a key of a mapping; use voltage"),
+        ("left.volts=/a.b", "not a key of a mapping"),
         ("voltage=/a.b:furlong", "cannot be in 'furlong'; use one of V"),
         ("velocity=/a.b*0", "leaves nothing"),
         ("velocity=/a.b*1/0", "divides by zero"),
@@ -98,7 +99,7 @@ def test_the_same_is_written_in_yaml_and_on_the_command_line(tmp_path: Path) -> 
         ("left.velocity=/a.b voltage=/c.d", "needs its wheel"),
     ],
 )
-def test_what_is_wrong_is_named_with_what_it_may_be(item: str, reason: str) -> None:
+def test_invalid_values_are_named_with_the_valid_ones(item: str, reason: str) -> None:
     with pytest.raises(BagError) as refused:
         parse([item])
     assert reason in str(refused.value)
@@ -118,7 +119,7 @@ def test_what_is_wrong_is_named_with_what_it_may_be(item: str, reason: str) -> N
         "\tx: 1",
     ],
 )
-def test_a_file_that_is_no_mapping_is_refused_by_its_name(tmp_path: Path, text: str) -> None:
+def test_a_file_that_is_not_a_mapping_is_refused_by_its_name(tmp_path: Path, text: str) -> None:
     file = tmp_path / "map.yaml"
     file.write_text(text)
     with pytest.raises(BagError, match=r"map\.yaml") as refused:
@@ -140,5 +141,5 @@ def test_a_level_that_no_column_holds_is_written_in_the_mapping(tmp_path: Path) 
 
 @pytest.mark.parametrize("name", ["a-b", "1", "a b", "ä", "a\n"])
 def test_a_wheel_needs_a_ros_name(name: str) -> None:
-    with pytest.raises(BagError, match="is no ROS name"):
+    with pytest.raises(BagError, match="is not a ROS name"):
         of({"motors": {name: {"voltage": "u", "velocity": "y"}}})

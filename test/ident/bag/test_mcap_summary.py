@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The summary at the end of an MCAP file, which says what the file holds and where."""
 
 from __future__ import annotations

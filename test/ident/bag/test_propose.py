@@ -1,4 +1,5 @@
-"""Mappings are proposed of signals that behave as what they are called, and tried before."""
+# SPDX-License-Identifier: Apache-2.0
+"""Proposed mappings have signals that behave according to their names, and can be read."""
 
 from __future__ import annotations
 
@@ -128,7 +129,7 @@ def test_a_step_that_no_test_can_confirm_is_proposed_by_names(
     path = write(tmp_path / "log.csv", Time_sec=T, Voltage_V=voltage, Speed_rad_s=speed)
     listing = list_topics(path)[0]
     assert listing.suggestion == ["voltage=Voltage_V", "velocity=Speed_rad_s", "time=Time_sec"]
-    assert listing.remark.startswith(f"Voltage_V {remark}, so that the data cannot confirm")
+    assert listing.remark.startswith(f"Voltage_V {remark}, so the data cannot confirm")
     assert len(read_records(path, listing.suggestion)["motor"]) == N
 
 
@@ -191,7 +192,7 @@ def test_where_names_tell_too_little_the_data_do(
 
 
 @pytest.mark.parametrize("error", ["Erro", "error", "Fehler", "ang_err"])
-def test_a_loops_error_is_no_motion(tmp_path: Path, error: str) -> None:
+def test_the_error_of_a_loop_is_not_a_motion(tmp_path: Path, error: str) -> None:
     voltage, speed = motor(12)
     rows = zip(T, 300.0 - speed, voltage)
     text = "\n".join(f"{t:.2f};{e:.4f};{v:.4f}" for t, e, v in rows)
@@ -252,7 +253,7 @@ def test_a_size_is_proposed_with_its_direction(tmp_path: Path) -> None:
     assert listing.suggestion == ["voltage=u", "velocity=w", "time=t"]
 
 
-def test_what_is_no_whole_number_is_no_count(tmp_path: Path) -> None:
+def test_fractional_numbers_are_not_counts(tmp_path: Path) -> None:
     voltage, speed = motor(15)
     path = write(tmp_path / "log.csv", t=T, u=voltage, encoder=np.cumsum(speed) * 0.01)
     assert list_topics(path)[0].suggestion == ["voltage=u", "position=encoder", "time=t"]
@@ -270,7 +271,7 @@ def test_what_is_no_whole_number_is_no_count(tmp_path: Path) -> None:
         (("t", "dutyIzquierda", "dutyDerecha", "velIzquierda", "velDerecha"), None),
     ],
 )
-def test_motors_side_by_side_are_told_by_what_their_names_end_in(
+def test_motors_are_told_apart_by_the_endings_of_names(
     tmp_path: Path, names: tuple[str, ...], wheels: tuple[str, str] | None
 ) -> None:
     (u, y), (v, z) = motor(21), motor(22)
@@ -302,7 +303,7 @@ def test_a_vin_that_is_switched_drives_and_one_that_stays_supplies(tmp_path: Pat
     assert list_topics(path)[0].remark == "no field is called a voltage"
 
 
-def test_the_nearest_word_says_what_a_part_of_a_structure_is(tmp_path: Path) -> None:
+def test_the_nearest_word_determines_the_role_of_a_field(tmp_path: Path) -> None:
     voltage, speed = motor(25)
     names = ("Vin_test.taco.time", "Vin_test.taco.values", "Vin_test.Vin.values")
     path = write(tmp_path / "log.csv", **dict(zip(names, (T, speed, voltage))))
@@ -311,7 +312,7 @@ def test_the_nearest_word_says_what_a_part_of_a_structure_is(tmp_path: Path) -> 
     assert list_topics(path)[0].suggestion == items
 
 
-def test_what_follows_by_chance_is_not_proposed(tmp_path: Path) -> None:
+def test_a_chance_correlation_is_not_proposed(tmp_path: Path) -> None:
     rng = np.random.default_rng(26)
     columns = {f"signal_{chr(97 + k)}": np.cumsum(rng.normal(0, 1, 32)) for k in range(16)}
     listing = list_topics(write(tmp_path / "log.csv", **columns))[0]
@@ -365,7 +366,7 @@ def test_an_angle_that_starts_again_at_360_is_in_degrees(tmp_path: Path) -> None
 def robot(
     corpus: SimpleNamespace, space: str, efforts: np.ndarray, seed: int, drive: str = "pwm"
 ) -> list[object]:
-    """Return the messages of one wheel: joint states with an effort, and what drives it."""
+    """Return the messages of one wheel: joint states with an effort, and its command."""
     number, joints = "std_msgs/msg/Float64", "sensor_msgs/msg/JointState"
     voltage, speed = motor(seed)
     sent = []
@@ -407,7 +408,7 @@ def test_an_effort_that_alone_explains_the_motion_is_proposed_with_a_note(
     sent = [s for s in robot(corpus, "", motor(1)[0], 1) if "pwm" not in s.topic]
     listing = list_topics(corpus.write_mcap(tmp_path / "bag.mcap", sent))[0]
     assert listing.suggestion[0] == "left.voltage=/joint_states.effort[left_wheel]"
-    assert "is a torque [N m] by the documentation of its message" in listing.remark
+    assert "is a torque [N m] by its message's documentation" in listing.remark
 
 
 def test_every_robot_of_a_bag_is_proposed(tmp_path: Path, corpus: SimpleNamespace) -> None:
@@ -443,7 +444,7 @@ def test_a_place_is_not_proposed_where_a_speed_is_named(tmp_path: Path) -> None:
     assert listing.suggestion == [] and listing.remark == "no field is called a voltage"
 
 
-def test_a_place_of_columns_is_no_drive(tmp_path: Path) -> None:
+def test_columns_of_a_pose_are_not_a_drive(tmp_path: Path) -> None:
     voltage, speed = motor(1)
     theta = 0.01 * np.cumsum(speed)
     path = write(tmp_path / "log.csv", x=voltage, y=np.cumsum(speed), theta=theta, omega=speed)

@@ -1,4 +1,5 @@
-"""Formats besides bags of ROS 2, each from a file that something else than its reader wrote."""
+# SPDX-License-Identifier: Apache-2.0
+"""Formats other than bags of ROS 2, from files written by other software."""
 
 from __future__ import annotations
 
@@ -262,7 +263,7 @@ def test_a_sysid_drivetrain_in_metres_needs_the_wheels_radius_only(tmp_path: Pat
     np.testing.assert_allclose(apart["right"].velocity, -0.5 * SPEED, atol=1e-9)
 
 
-def test_what_is_suggested_for_a_drivetrain_in_metres_asks_for_the_radius(tmp_path: Path) -> None:
+def test_the_suggestion_for_a_drivetrain_in_metres_requests_the_radius(tmp_path: Path) -> None:
     path = drivetrain(tmp_path / "sysid.json")
     listing = list_topics(path)[0]
     assert "left.velocity=left_velocity:m/s" in listing.suggestion
@@ -401,7 +402,7 @@ def test_of_a_bag_of_ros_1_that_is_cut_off_the_rest_is_read(tmp_path: Path) -> N
 
 
 def test_a_workbook_is_read_as_excel_shows_it(tmp_path: Path) -> None:
-    # ECMA-376, 18.8.30: a number format of a share shows a hundred times what is stored; times are
+    # ECMA-376, 18.8.30: a percentage shows a hundred times the stored value; times are
     # parts of a day
     book = openpyxl.Workbook()
     book.active.append(["time", "duty", "speed"])

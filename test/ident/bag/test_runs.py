@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Tables whose clock starts again hold several runs; rows that are merely late are sorted."""
 
 from __future__ import annotations
@@ -226,7 +227,7 @@ def test_files_of_several_runs_are_joined_with_others(tmp_path: Path) -> None:
     assert record.starts == (0, 300, 600)
 
 
-def test_runs_below_one_another_do_not_hide_what_explains_the_speed(tmp_path: Path) -> None:
+def test_several_runs_in_a_table_do_not_hide_the_voltage(tmp_path: Path) -> None:
     rows = np.concatenate([run(300, k) for k in range(4)])
     path = write(tmp_path / "log.csv", rows)
     assert list_topics(path)[0].suggestion == ["voltage=u", "velocity=w", "time=t"]

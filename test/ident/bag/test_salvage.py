@@ -1,4 +1,5 @@
-"""Rows out of the pages of a SQLite file, against what sqlite3 itself wrote there."""
+# SPDX-License-Identifier: Apache-2.0
+"""Rows recovered from the pages of a SQLite file, compared with those written by sqlite3."""
 
 from __future__ import annotations
 

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Any numeric field of any message becomes a signal in SI at the motor shaft."""
 
 from __future__ import annotations
@@ -276,14 +277,14 @@ def test_units_scales_and_shafts_come_out_in_si_at_the_motor(
     [
         ("voltage=/nope.data velocity=/w.data", "has no /nope; it has /u, /w"),
         ("voltage=/u.nope velocity=/w.data", "field 'nope' does not exist: no 'nope' among data"),
-        ("voltage=/u.data[0] velocity=/w.data", "is no array"),
+        ("voltage=/u.data[0] velocity=/w.data", "is not an array"),
         ("voltage=/u.data", "gives no velocity, position or count"),
         ("velocity=/w.data", "gives no voltage"),
         ("voltage=u velocity=/w.data", "a topic for voltage"),
         ("voltage=/u.data velocity=/w.data clock=header", "no usable header time"),
     ],
 )
-def test_a_mapping_that_does_not_fit_is_refused_with_what_is_there(
+def test_a_mapping_that_does_not_fit_is_refused_with_the_available_fields(
     tmp_path: Path, corpus: SimpleNamespace, mapping: str, reason: str
 ) -> None:
     messages = in_order(floats(corpus, "/u", [1.0] * 9), floats(corpus, "/w", [60.0] * 9))
@@ -305,12 +306,12 @@ def test_messages_that_are_not_of_their_type_are_left_out_and_told(
     messages[70] = corpus.Sent(messages[70].topic, corpus.STATE, messages[70].stamp, b"")
     record = read_records(corpus.write_mcap(tmp_path / "bag.mcap", messages))["front_left"]
     assert len(record) == 98
-    assert "2 messages are no smp_interfaces/msg/MotorState" in " ".join(
+    assert "2 messages are not of type smp_interfaces/msg/MotorState" in " ".join(
         f.message for f in record.findings
     )
 
 
-def test_what_a_bag_offers_is_listed(tmp_path: Path, corpus: SimpleNamespace) -> None:
+def test_the_topics_of_a_bag_are_listed(tmp_path: Path, corpus: SimpleNamespace) -> None:
     n = 30
     messages = in_order(
         floats(corpus, "/left/pwm", np.arange(n)),

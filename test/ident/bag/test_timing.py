@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Time: which clock, order, losses, gaps, wrap-around and held inputs."""
 
 from __future__ import annotations
@@ -102,7 +103,7 @@ def test_a_few_lost_samples_are_bridged_and_more_begin_a_segment(
     notes = " ".join(f.message for f in record.findings)
     assert "3 samples missing in 2 places" in notes
     assert "2 gaps of up to 0.51 s (55 samples missing)" in notes
-    # The mean of a ramp over two and three intervals, of which only the last was seen.
+    # The mean of a ramp over two and three intervals; only the last was recorded.
     step = ramp[1] - ramp[0]
     index = list(kept)
     assert record.voltage[index.index(51)] == pytest.approx(ramp[51] - step / 2)
@@ -129,7 +130,7 @@ def test_duplicates_are_left_out_and_told(tmp_path: Path, corpus: SimpleNamespac
     messages = truth.messages()
     record = corpus.read(tmp_path / "bag.mcap", [*messages, *messages[40:60]])
     corpus.assert_read(record, truth)
-    assert "20 samples have the time of another and were left out (duplicates)" in " ".join(
+    assert "20 samples with a repeated time were left out (duplicates)" in " ".join(
         [f.message for f in record.findings]
     )
 
@@ -232,7 +233,7 @@ def test_a_stamped_output_meets_an_unstamped_input_by_offset_and_drift(
     notes = " ".join(f.message for f in record.findings)
     assert "offset and drift" in notes
     assert "drifting by +50 ppm" in notes
-    # Mean over the interval of what was held: at most one input period old, none in the future.
+    # Mean of the held value over the interval: at most one input period old, never in the future
     lag = record.velocity - record.voltage
     assert lag.min() >= 0.0
     # Half an output period plus up to one input period, plus latency that cannot be known.
@@ -350,7 +351,7 @@ def test_recordings_of_different_gearboxes_are_not_joined(
         join_records([record, other])
 
 
-def test_what_only_some_recordings_have_stays_known_where_it_is(
+def test_signals_of_only_some_recordings_are_kept_there(
     tmp_path: Path, corpus: SimpleNamespace
 ) -> None:
     record = corpus.read(tmp_path / "bag.mcap", corpus.motion(n=20).messages())
@@ -367,7 +368,7 @@ def test_a_recording_knows_when_it_began_where_its_clock_was_set(
     truth = corpus.motion()
     (record,) = read_records(corpus.write_mcap(tmp_path / "a.mcap", truth.messages())).values()
     assert record.recorded == pytest.approx(1e-9 * corpus.START, abs=1.0)
-    # A computer without a battery begins at 1970: that is no date.
+    # A computer without a clock battery starts at 1970, which is not a date.
     early = replaced(truth, time=truth.time - corpus.START)
     (record,) = read_records(corpus.write_mcap(tmp_path / "b.mcap", early.messages())).values()
     assert record.recorded is None
@@ -389,7 +390,7 @@ def test_a_clock_that_is_set_forward_begins_a_segment_and_costs_no_time(
     assert found.evidence["longest"] == pytest.approx(leap * 1e-9, rel=1e-6)
 
 
-def test_all_topics_keep_what_they_are_apart_where_the_clock_is_set(
+def test_offsets_between_topics_are_kept_where_the_clock_is_set(
     tmp_path: Path, corpus: SimpleNamespace
 ) -> None:
     number, leap = "std_msgs/msg/Float64", 10**18

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The delay of a loop, measured from bags of loops whose delay is known."""
 
 from __future__ import annotations
@@ -30,7 +31,7 @@ def driven_bag(
     wanted = rng.uniform(-6, 6, arrival.size)
     begin = one.time[0]
     acts = np.arange(arrival.size) * PERIOD + arrival
-    if latch:  # the driver's next sample takes what has come
+    if latch:  # the driver's next sample takes the last command
         acts = np.ceil(acts / PERIOD).astype(np.int64) * PERIOD
     volts = np.zeros(arrival.size * PERIOD // FINE)
     for k in np.argsort(acts, kind="stable"):
@@ -59,7 +60,7 @@ def test_driver_that_applies_on_arrival_tells_its_delay(tmp_path, corpus):
     ]
     assert not found.latched
     assert found.answers == 600
-    # One delay stands for all: within the spread of the tail, one trial step (0.25 ms) beside.
+    # One delay for all, within the spread of the tail and one trial step (0.25 ms).
     assert found.usual == pytest.approx(1e-9 * np.median(arrival), abs=0.3e-3)
     assert found.longest == pytest.approx(1e-9 * np.quantile(arrival, 0.95), abs=1e-6)
     assert found.until_applied(0.002) == (found.usual, found.longest)
@@ -90,7 +91,7 @@ def test_bag_whose_commands_answer_nothing_is_refused(tmp_path, corpus):
         measure_delay(bag)
 
 
-def test_tune_designs_for_the_delay_of_a_bag_and_says_so(tmp_path, corpus, capsys):
+def test_tune_designs_for_the_delay_of_a_bag_and_reports_it(tmp_path, corpus, capsys):
     bag = driven_bag(corpus, tmp_path / "a.mcap", arrivals() + 6_000_000, latch=False)
     output = tmp_path / "gains.yaml"
     assert tune([str(MOTORS), "--bag", str(bag), "--output", str(output)]) == 0
@@ -102,4 +103,4 @@ def test_tune_designs_for_the_delay_of_a_bag_and_says_so(tmp_path, corpus, capsy
     assert loops["rear_left"]["loop"]["delay"] == 0.005
     for text in (capsys.readouterr().out, output.read_text()):
         assert "600 commands of" in text
-        assert "rear_left" in text and "tells no delay: taken as one sample" in text
+        assert "rear_left" in text and "has no delay data; one sample is assumed" in text

@@ -1,4 +1,5 @@
-"""A recording cut off at any byte gives what is there, and says that something is missing."""
+# SPDX-License-Identifier: Apache-2.0
+"""A recording cut off at any byte gives its whole messages and a finding on the loss."""
 
 from __future__ import annotations
 
@@ -21,7 +22,7 @@ LOST = ("cut off", "damaged", "could be read", "is empty", "compression", "not a
 
 
 def samples_and_words(path: Path) -> tuple[int, str]:
-    """Read what can be read: number of samples, and everything that was said."""
+    """Read a damaged bag: number of samples, and all messages."""
     try:
         record = next(iter(read_records(path).values()))
     except BagError as error:
@@ -109,7 +110,7 @@ def test_a_compressed_file_cut_at_every_kilobyte(
     assert_every_cut_is_sound(pack(plain.read_bytes()), path, 400, 400)
 
 
-def test_a_cut_bag_tells_how_much_of_what_the_metadata_count(
+def test_a_cut_bag_reports_its_share_of_the_declared_messages(
     tmp_path: Path, corpus: SimpleNamespace
 ) -> None:
     truth = corpus.motion(n=400)
@@ -151,7 +152,7 @@ def test_random_damage_never_ends_in_a_traceback(tmp_path: Path, corpus: SimpleN
             samples_and_words(path)
 
 
-def test_a_tail_of_zeros_is_no_message(tmp_path: Path, corpus: SimpleNamespace) -> None:
+def test_a_tail_of_zeros_is_not_a_message(tmp_path: Path, corpus: SimpleNamespace) -> None:
     truth = corpus.motion(n=400)
     path = corpus.write_mcap(tmp_path / "bag.mcap", truth.messages(), use_chunking=False)
     data = path.read_bytes()
@@ -174,7 +175,7 @@ def test_a_writer_that_was_killed_leaves_a_bag_that_everybody_reads(
     for sent in truth.messages():
         bag.write(sent.topic, sent.type, sent.data, sent.stamp)
         bag.flush(force=True)
-    # Never closed: the files as they are now are what a kill leaves.
+    # Never closed: a kill leaves the files in this state.
     with AnyReader([tmp_path / "bag"]) as reader:
         assert sum(1 for _ in reader.messages()) == 301
     record = read_records(tmp_path / "bag")["front_left"]

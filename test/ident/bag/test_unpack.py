@@ -1,4 +1,5 @@
-"""Decompression: every frame, every kind, what is cut off, and never more than the limit."""
+# SPDX-License-Identifier: Apache-2.0
+"""Decompression of all kinds, with several frames or cut off, and its limit."""
 
 from __future__ import annotations
 
@@ -58,7 +59,9 @@ def test_frames_come_out_whole_whatever_the_blocks_they_are_read_in(kind) -> Non
             continue  # slow and no other way
         blocks = [packed[k : k + length] for k in range(0, len(packed), length)]
         assert b"".join(pieces(blocks, kind)) == PLAIN
-    assert max(len(piece) for piece in pieces([packed], kind)) <= 1 << 20
+    biggest = max(len(piece) for piece in pieces([packed], kind))
+    # 1024 bytes of zstd expand to at most 256 blocks of 128 KiB; the others come by the MiB.
+    assert biggest <= (256 << 17 if kind == "zstd" else 1 << 20)
     with pytest.raises(EOFError):
         list(pieces([], kind))
     with pytest.raises(EOFError):
@@ -66,13 +69,13 @@ def test_frames_come_out_whole_whatever_the_blocks_they_are_read_in(kind) -> Non
 
 
 @pytest.mark.parametrize("kind", PACK)
-def test_what_comes_before_the_end_of_a_block_that_is_cut_off_is_kept(kind, budget) -> None:
+def test_the_part_of_a_block_before_its_cut_is_kept(kind, budget) -> None:
     packed = PACK[kind](PARTS[0]) + PACK[kind](PARTS[1])[:-300]
     kept = decompress(packed, kind, budget)
     assert PLAIN.startswith(kept) and len(kept) >= len(PARTS[0])
     assert budget.limit - budget.left == len(kept)
     cut = decompress(PACK[kind](PLAIN)[:-40], kind, budget)
-    # Small frames come as a whole or not at all, of large ones what was complete.
+    # A small frame is read whole or not at all, a large one up to its last complete block.
     assert PLAIN.startswith(cut)
     assert decompress(b"no frame at all", kind, budget) == b""
 
@@ -86,12 +89,12 @@ def test_an_unknown_compression_is_named(budget) -> None:
     ("given", "limit"),
     [("", 256e6), ("1000", 1000), ("2k", 2048), ("3M", 3 * 2**20), (" 1.5G ", 1.5 * 2**30)],
 )
-def test_the_limit_is_what_the_file_may_hold_or_what_the_user_says(given, limit, monkeypatch):
+def test_the_limit_follows_from_the_size_or_from_the_user(given, limit, monkeypatch):
     monkeypatch.setenv("SMP_BAG_UNPACKED", given)
     budget = Budget("a.mcap", 100_000)
     assert budget.limit == budget.left == limit
     big = Budget("a.mcap", 100_000_000)
-    assert big.limit == (limit if given else 5e9)  # 50 times what is packed
+    assert big.limit == (limit if given else 5e9)  # 50 times the packed size
     for wrong in ("much", "inf", "K"):
         monkeypatch.setenv("SMP_BAG_UNPACKED", wrong)
         with pytest.raises(BagError, match="give bytes, or such as 512M or 8G"):
@@ -113,7 +116,7 @@ def test_the_limit_itself_may_be_taken_and_not_a_byte_more(monkeypatch) -> None:
 
 
 @pytest.mark.parametrize("kind", PACK)
-def test_a_file_is_unpacked_and_what_is_amiss_is_told(kind, budget, tmp_path: Path) -> None:
+def test_a_file_is_unpacked_and_damage_is_reported(kind, budget, tmp_path: Path) -> None:
     path, plain = tmp_path / "a.mcap.x", tmp_path / "a.mcap"
     path.write_bytes(b"".join(map(PACK[kind], PARTS)))
     assert unpack_file(path, plain, kind, budget) == ""

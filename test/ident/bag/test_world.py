@@ -1,4 +1,5 @@
-"""Tables as loggers of the world write them: every one holds the same 300 samples."""
+# SPDX-License-Identifier: Apache-2.0
+"""Tables in the forms of many loggers, each with the same 300 samples."""
 
 from __future__ import annotations
 
@@ -108,7 +109,7 @@ def test_set_and_state_in_two_files_are_one_recording_on_their_clocks(tmp_path: 
 def test_a_file_with_more_words_than_rows_is_refused_by_its_line(tmp_path: Path) -> None:
     lines = [line if k % 10 else "Brown-out!" for k, line in enumerate(rows())]
     (tmp_path / "log.csv").write_text(text(lines))
-    with pytest.raises(BagError, match="line 12, column 't': 'Brown-out!' is no number"):
+    with pytest.raises(BagError, match="line 12, column 't': 'Brown-out!' is not a number"):
         read_records(tmp_path / "log.csv", [MAP])
 
 

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The bag writer: what ros2 bag and rosbags expect, at every moment."""
 
 from __future__ import annotations
@@ -168,7 +169,7 @@ def test_recorded_qos_of_every_version_is_understood(
 
 
 @pytest.mark.parametrize("storage", ["mcap", "db3"])
-def test_what_is_not_asked_for_takes_no_memory(
+def test_unmapped_topics_take_no_memory(
     tmp_path: Path, corpus: SimpleNamespace, storage: str
 ) -> None:
     truth = corpus.motion(n=500)
@@ -183,7 +184,7 @@ def test_what_is_not_asked_for_takes_no_memory(
     else:
         path = corpus.write_sqlite(tmp_path / "bag.db3", messages)
     assert path.stat().st_size > 20_000_000
-    read_records(path)  # what is loaded once is not what is measured
+    read_records(path)  # load modules before measuring
     tracemalloc.start()
     record = read_records(path)["front_left"]
     _, peak = tracemalloc.get_traced_memory()

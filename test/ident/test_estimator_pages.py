@@ -1,0 +1,89 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The pages on the estimator against the code: functions, effects, quantities and output."""
+
+from __future__ import annotations
+
+import ast
+import re
+from pathlib import Path
+
+import pytest
+
+from smp_motor_ident.chain.catalogue import ALL
+from smp_motor_ident.result import UNITS
+
+ROOT = Path(__file__).resolve().parents[2]
+PLAIN = {"first_order", "second_order", "electromechanical", "friction", "speed", "angle",
+         "current"}  # fmt: skip
+NUMBER = re.compile(r"-?\d+(?:\.\d+)?(?:e[-+]\d+)?")
+
+
+def page(name: str) -> str:
+    (path,) = (p for p in ROOT.glob(f"docs/**/{name}") if not {"_build", "benchmarks"} & {*p.parts})
+    return path.read_text(encoding="utf-8")
+
+
+def fences(text: str, language: str) -> list[str]:
+    return re.findall(rf"^```{language}\n(.*?)^```$", text, re.DOTALL | re.MULTILINE)
+
+
+def names_in(file: str) -> set[str]:
+    """Return the functions, methods and classes that a file defines."""
+    tree = ast.parse((ROOT / "smp_motor_ident" / file).read_text(encoding="utf-8"))
+    kinds = (ast.FunctionDef, ast.AsyncFunctionDef, ast.ClassDef)
+    return {node.name for node in ast.walk(tree) if isinstance(node, kinds)}
+
+
+def drawn() -> list[tuple[str, str]]:
+    """Return functions and files of the drawings, in their order."""
+    lines = "".join(fences(page("record.md"), "text")).splitlines()
+    rows = [re.search(r"([a-zA-Z_, ]+?) {2,}([\w/]+\.py)", line) for line in lines]
+    return [(name, row[2]) for row in rows if row for name in row[1].strip().split(", ")]
+
+
+def test_every_function_of_the_drawings_is_in_its_file() -> None:
+    assert len(drawn()) > 50
+    for name, file in drawn():
+        assert name in names_in(file), f"{file} has no {name}"
+
+
+def test_types_of_the_page_are_in_their_files() -> None:
+    rows = re.findall(r"^\| `(\w+)` \| `([\w/]+\.py)` \|", page("record.md"), re.MULTILINE)
+    assert len(rows) == 10
+    for name, file in rows:
+        assert name in names_in(file), f"{file} has no {name}"
+
+
+def test_functions_are_drawn_in_the_order_in_which_they_are_called() -> None:
+    text = (ROOT / "smp_motor_ident/estimate.py").read_text(encoding="utf-8")
+    body = text[text.index("    group = [records]") :]
+    calls = ["checked(", "repaired(", "screen(", "excitation(", "prepare(", "_best_fit(",
+             "levels_of(", "contributions(", "= answer(", "fit_percents(", "residual_tests(",
+             "refuse(", "candidates_of(", "findings_of(", "provenance("]  # fmt: skip
+    assert [body.index(c) for c in calls] == sorted(body.index(c) for c in calls)
+    order = [name for name, _ in drawn()]
+    names = [re.sub(r"\W", "", c) for c in calls]
+    assert [order.index(n) for n in names] == sorted(order.index(n) for n in names)
+
+
+def test_table_of_effects_is_the_catalogue() -> None:
+    rows = page("identification.md").split("## Effects that are found")[1].splitlines()
+    cells = [line.split("|") for line in rows if line.startswith("| `")]
+    codes = [code for row in cells for code in re.findall(r"`(\w+)`", row[1])]
+    assert sorted(codes) == sorted({one.code for one in ALL} - PLAIN)
+    sizes = [name for row in cells for name in re.findall(r"`(\w+)`", row[3])]
+    assert set(sizes) <= set(UNITS)
+
+
+def test_program_of_the_page_prints_what_the_page_shows(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    text = page("identification.md")
+    (program,) = fences(text, "python")
+    shown = fences(text, "text")[1].splitlines()
+    exec(compile(program, "identification", "exec"), {})
+    for line, fresh in zip(shown, capsys.readouterr().out.splitlines(), strict=True):
+        assert NUMBER.sub("#", line) == NUMBER.sub("#", fresh)
+        for a, b in zip(NUMBER.findall(line), NUMBER.findall(fresh), strict=True):
+            # One digit of a standard deviation is shown.
+            assert float(a) == pytest.approx(float(b), rel=0.3 if len(a) < 6 else 1e-3)

@@ -1,0 +1,65 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Limits of the answer that no other test shows, through `estimate` alone."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import motors
+import numpy as np
+import pytest
+
+from smp_motor_ident.estimate import estimate
+from smp_motor_ident.result import NORMAL_95, Quantity, Share
+
+
+def share_of(quantity: Quantity, cause: str) -> Share | None:
+    return next((s for s in quantity.systematic if s.cause == cause), None)
+
+
+@pytest.mark.parametrize("scale", [0.96, 1.04])
+def test_scale_error_of_a_current_is_within_the_systematic_uncertainty(scale: float) -> None:
+    # 4 %: the tolerance that a Hall sensor is sold with.
+    made = motors.record("rear_left", seconds=3.0)
+    assert made.current is not None
+    truth = motors.truth("rear_left", 0.3)
+    found = estimate(replace(made, current=scale * made.current)).parameters
+    for name in ("resistance", "inertia", "coulomb_friction"):
+        value, low, high = found[name].value, *(found[name].total_ci95 or (np.nan, np.nan))
+        assert low < truth[name] < high
+        share = share_of(found[name], "current_scale")
+        assert share is not None and value is not None
+        assert share.size == pytest.approx(0.03 * value)
+        # The scale is no scatter: the random interval does not reach the truth.
+        assert abs(value - truth[name]) > NORMAL_95 * (found[name].std or 0.0)
+    assert share_of(found["motor_constant"], "current_scale") is None
+
+
+def test_accuracy_of_the_current_that_is_stated_replaces_the_assumed_one() -> None:
+    made = motors.record("rear_left", seconds=3.0)
+    stated = replace(made, hardware=replace(made.hardware, current_accuracy=0.2))
+    share = share_of(estimate(stated).parameters["resistance"], "current_scale")
+    assert share is not None and share.share == pytest.approx(0.2)
+
+
+def test_gain_at_one_amplitude_is_sharp_and_states_where_it_holds() -> None:
+    made = motors.record("rear_left", current=False, kinds=("square",), seconds=10.0)
+    found = estimate(made)
+    gain = found.combinations["dc_gain"]
+    assert gain.value == pytest.approx(motors.truth("rear_left", 0.3)["dc_gain"], rel=0.01)
+    assert gain.std is not None and gain.std < 0.005 * gain.value
+    assert gain.valid == {"voltage": (-10.0, 10.0)}
+    one_size = share_of(gain, "one_size_of_voltage")
+    assert one_size is not None and one_size.share is not None
+    assert 0.02 < one_size.share < 0.5
+    # A voltmeter ten times as good as the assumed bridge leaves a tenth of it.
+    meter = replace(made, hardware=replace(made.hardware, voltage_accuracy=0.01))
+    measured = share_of(estimate(meter).combinations["dc_gain"], "one_size_of_voltage")
+    assert measured is None or measured.size == pytest.approx(0.1 * one_size.size, rel=0.05)
+
+
+def test_a_motor_that_friction_nearly_holds_is_unreliable() -> None:
+    held = estimate(motors.record("rear_left", static_voltage=5.5, seconds=4.0))
+    assert next(f for f in held.findings if f.code == "friction_dominates").severity == "unreliable"
+    turns = estimate(motors.record("rear_left", static_voltage=4.5, seconds=4.0))
+    assert "friction_dominates" not in [f.code for f in turns.findings]
