@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Install rules: an ament_python package for colcon, and a Python package for pip."""
 
 import os
@@ -43,7 +44,7 @@ REQUIRES = [
     "pyyaml>=6",  # parameter files
 ]
 EXTRAS = {
-    "ros": [  # what the nodes need, as wheels, where no ROS 2 Jazzy is sourced
+    "ros": [  # requirements of the nodes, as wheels, without a sourced ROS 2 Jazzy
         "ros-jazzy-rclpy[fastrtps]",
         "ros-jazzy-common-interfaces",
         "mcap>=1.2,<2",  # writes bags that are closed at every flush

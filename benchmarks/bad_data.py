@@ -1,6 +1,7 @@
-"""Records of random motors, sound and spoilt: what the tool names, and what it takes for good.
+# SPDX-License-Identifier: Apache-2.0
+"""Records of random motors, sound and damaged: faults named and faults missed.
 
-Motor, rate, wave, amplitude, encoder, noise and the signals there are, are drawn at random.
+Motor, rate, wave, amplitude, encoder, noise and available signals are drawn at random.
 
     python benchmarks/bad_data.py [--records 20] [--sound 200] [--lines FILE.jsonl]
 """
@@ -16,12 +17,10 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from known_motors import EXACT, TABLE_1, independent, table
+from known_motors import EXACT, TABLE_1, independent, motor_of, substeps, table, truth_of
 
 from smp_motor_ident.errors import SmpError
 from smp_motor_ident.estimate import estimate
-from smp_motor_ident.model.physical import from_physical, physical
-from smp_motor_ident.model.structures import SecondOrder
 from smp_motor_ident.record import Hardware, Record
 
 WAVES = ("sine", "square", "fourier", "prbs", "steps", "chirp", "ramps")
@@ -72,9 +71,9 @@ def sound(
     static = supply * rng.choice([0.0, 0.01, 0.03, 0.06])
     noise = rng.choice([0.0, 0.0, 0.05]) * supply
     load = noise * k / r * rng.standard_normal(t.size)
-    te, tm = el / r, r * j / (k + r * b / k)
-    steps = int(np.clip(20 / rate / max(min(te, tm / k), 1e-6), 20, 2000))
-    out = independent.simulate(t, v, r, el, k, j, b, static * k / r, load, steps)
+    motor = motor_of((r, el, k, j, b), static)
+    steps = substeps(motor, 1 / rate)
+    out = independent.simulate(t, v, r, el, k, j, b, motor.coulomb_friction, load, steps)
     turn = float(rng.choice([12, 48, 500, 2048, 4096]))
     quantum = 2 * np.pi / turn
     count = np.floor(out[:, 2] / quantum + rng.uniform()).astype(np.int64)
@@ -95,12 +94,10 @@ def sound(
         hardware=Hardware(30.0, turn if counted else None, 0, supply, None, *EXACT),
         source=f"record {seed}",
     )  # fmt: skip
-    z = from_physical(r, el, k, j, b, static * k / r)
-    truth = {**physical(z), **{n: v for n, (v, _) in SecondOrder().combinations(z).items()}}
     about = {"seed": seed, "rate": rate, "wave": str(kind), "signals": str(signals), "tau": tau,
              "current": current is not None, "static": static, "torque": noise, "turn": turn,
              "samples": t.size}  # fmt: skip
-    return made, {**about, "truth": truth}
+    return made, {**about, "truth": truth_of(motor)}
 
 
 def _scaled(record: Record, name: str, factor: float) -> Record:
@@ -162,7 +159,7 @@ def swapped_current(record: Record, rng: np.random.Generator) -> Record | None:
 
 
 def wrong_ratio(record: Record, rng: np.random.Generator) -> Record | None:
-    """Scale the speed beside the counts."""
+    """Scale the speed relative to the counts."""
     if record.count is None or record.velocity is None:
         return None
     return _scaled(record, "velocity", float(rng.choice([0.25, 0.5, 0.8, 1.25, 2, 4, 30])))
@@ -229,7 +226,7 @@ DRIVES = {
 
 
 def judge(record: Record, truth: dict, words: str = "") -> dict:
-    """Return what the tool says of a record."""
+    """Return the tool's result for a record."""
     begun = time.perf_counter()
     try:
         e = estimate(record)
@@ -248,7 +245,7 @@ def judge(record: Record, truth: dict, words: str = "") -> dict:
     worst = max(errors, key=lambda n: errors[n])
     says = "unreliable" if doubt else ("wrong" if errors[worst] > FAR else "right")
     if says == "right" and words and any(w in "; ".join(e.warnings) for w in words.split("|")):
-        says = "named"  # and what it says is right without what is bad
+        says = "named"  # and the result without the bad part is right
     off = abs(claims[worst].value / truth[worst] - 1) if truth[worst] else claims[worst].value
     return {"says": says, "words": "; ".join(e.warnings), "worst": worst, "sigmas": errors[worst],
             "off": off, "model": e.model, "fit": e.fit_percent.estimation,

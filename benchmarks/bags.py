@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Bags to records, against iterating and deserializing with rosbags, in one run.
 
     python benchmarks/bags.py [--seconds 60] [--rate 1000] [--long 10]
@@ -150,7 +151,7 @@ def peak() -> int:
 
 
 def measure(way: str, path: Path, repeat: int) -> None:
-    """Print seconds of CPU, what the way returned, and the memory that it took at most."""
+    """Print CPU time [s], result and peak memory of a way."""
     import rosbags.highlevel  # noqa: F401  (loaded before the memory is looked at)
 
     small = path.parent / ("small" if path.is_dir() else "small.db3")

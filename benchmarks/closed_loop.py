@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """One wheel's loop, simulated by fixed small steps: shares no code with the designer.
 
 Motor by its physical equations (Runge-Kutta), encoder as floored counts, PID written from the
@@ -48,7 +49,7 @@ class Controller:
 
 @dataclass(frozen=True)
 class Conditions:
-    """What the loop runs under."""
+    """Operating conditions of the loop."""
 
     sample_time: float
     delay: float

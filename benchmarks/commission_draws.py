@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """``commission`` on robots drawn at random, some of them wired or supplied wrongly.
 
     python benchmarks/commission_draws.py                      # forty robots
@@ -161,7 +162,7 @@ def main() -> int:
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--duration", type=float, default=6.0, help="of each signal [s]; default 6")
     parser.add_argument("--case", choices=RIGHT, help="this case only")
-    parser.add_argument("--keep", metavar="DIR", help="keep what was written, one folder a draw")
+    parser.add_argument("--keep", metavar="DIR", help="keep the results, one folder per draw")
     given = parser.parse_args()
     os.environ.setdefault("ROS_DOMAIN_ID", "106")
     os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"

@@ -1,4 +1,5 @@
-"""``commission`` killed at random moments, in any of its processes: what is left of it?
+# SPDX-License-Identifier: Apache-2.0
+"""Kill ``commission`` at random moments, in any of its processes, and check its results.
 
     python benchmarks/commission_kills.py                   # fifty kills, seed of the day
     python benchmarks/commission_kills.py --kills 5 --seed 3
@@ -42,7 +43,11 @@ Values = dict[str, tuple[float, float]]
 MARK = "SMP_CAMPAIGN"
 """Environment variable that the tool hands down to all that it starts."""
 WHEELS = ("front_left", "rear_left")
-QUIET = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL, "stdin": subprocess.DEVNULL}
+QUIET = {
+    "stdout": subprocess.DEVNULL,
+    "stderr": subprocess.DEVNULL,
+    "stdin": subprocess.DEVNULL,
+}
 DURATION = 4.0
 """Of each signal [s]; each of four is recorded by processes of its own, then the tool computes."""
 LASTS = {"commission": 80.0, "excite": DURATION + 2.0, "record": DURATION + 4.0}
@@ -79,7 +84,7 @@ def plays(part: str, arguments: list[str]) -> bool:
 
 
 class Campaign:
-    """Plant and controllers, and what is seen of them."""
+    """Plant and controllers, with their states."""
 
     def __init__(self, domain: int, slack: float) -> None:
         from wheel_robot import WheelRobot
@@ -171,7 +176,7 @@ class Campaign:
         }
 
     def resumed(self, whole: Values) -> str:
-        """Go on with what was cut off; return how it differs from a run that was not."""
+        """Resume an interrupted run; return its differences from an uninterrupted one."""
         begun = (self.folder / "commissioning.json").is_file()
         wrong, values = self.result(*["--resume"] * begun)
         if wrong:

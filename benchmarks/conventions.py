@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Recordings as other people's simulators write them: right, called unreliable, refused or silent.
 
 A small midpoint simulator drives random motors by the signals of a textbook.  What varies is the
@@ -38,7 +39,7 @@ def motor(rng: np.random.Generator) -> tuple[float, float, float, float, float]:
 
 
 def truths(m: tuple[float, ...], tc: float) -> dict[str, float]:
-    """Return what an identification may state."""
+    """Return the true values that an identification may state."""
     r, el, k, j, b = m
     below = k * k + r * b
     return {
@@ -93,7 +94,7 @@ def _simulate(r, el, k, j, b, tc, t, u, straight, steps):
 
 
 def recording(seed: int):
-    """Return a random record, its truth, its supply and what it is."""
+    """Return a random record, its truth, its supply and its description."""
     from smp_motor_ident.record import Hardware, Record
 
     rng = np.random.default_rng(seed)

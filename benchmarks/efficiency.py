@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Mean squared error over the Cramer-Rao bound, and coverage of the 95 % intervals.
 
 Every realisation is one line of a file, so that a long run may be stopped and taken up again:
@@ -11,61 +12,118 @@ import argparse
 import json
 import time
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from known_motors import CURRENT_NOISE, QUANTUM, TABLE_1, recording, table
+from known_motors import (
+    CURRENT_NOISE,
+    QUANTUM,
+    TABLE_1,
+    independent,
+    recording,
+    substeps,
+    table,
+)
+from scipy.linalg import solve_triangular, toeplitz
 
-from smp_motor_control.motor.parameters import PHYSICAL
+from smp_motor_control.motor.parameters import PHYSICAL, MotorParameters
 from smp_motor_ident.errors import SmpError
 from smp_motor_ident.estimate import estimate
-from smp_motor_ident.likelihood.experiments import prepare
-from smp_motor_ident.likelihood.noise import NoiseModel, kalman_gain
-from smp_motor_ident.likelihood.passes import evaluate
-from smp_motor_ident.model.measurement import ANGLE
-from smp_motor_ident.model.physical import physical_gradients
-from smp_motor_ident.model.structures import Electromechanical, SecondOrder
+from smp_motor_ident.record import Record
 
 COMBINATIONS = ("dc_gain", "time_constant", "time_constant_product")
 KINDS = ("sine", "square", "fourier", "plain square")
 TELLS = 0.3  # a quantity is identifiable where the bound's std is below this part of it
+VARIED = 1e-4  # relative, for a derivative
 
 
-def bound(record, z, current: bool, torque: float) -> dict[str, tuple[float, float]]:
-    """Return the truth and the Cramer-Rao variance of every quantity, at the truth."""
-    structure = Electromechanical() if current else SecondOrder(shape=True)
-    data = prepare([record], current)
-    step = data.step
-    noise = np.diag([QUANTUM**2 / 12, CURRENT_NOISE**2])
-    gain = np.zeros((3, 2))
+def covariance(
+    record: Record, motor: MotorParameters, names: tuple[str, ...], torque: float = 0.0
+) -> np.ndarray:
+    """Return the Cramer-Rao bound of the logarithms of parameters, the others being known.
+
+    Derivatives are differences between runs of the independent simulator.  Quantisation is taken
+    for white noise; the angle at which the encoder begins is free.  ``torque``: standard deviation
+    of a load that is held for a sample, as a voltage [V].
+
+    Raises
+    ------
+    LinAlgError
+        Where the parameters are not identifiable.
+    """
+    noise = QUANTUM / np.sqrt(12)
+
+    def shown(changed: MotorParameters) -> np.ndarray:
+        out = simulated(changed, record.time, record.voltage)
+        angle, current = out[:, 2] / noise, out[:, 0] / CURRENT_NOISE
+        return angle if record.current is None else np.concatenate([angle, current])
+
+    def varied(name: str, factor: float) -> MotorParameters:
+        return replace(motor, **{name: factor * getattr(motor, name)})
+
+    each = [(shown(varied(n, 1 + VARIED)) - shown(varied(n, 1 - VARIED))) / (2 * VARIED)
+            for n in names]  # fmt: skip
+    begin = np.zeros_like(each[0])
+    begin[: len(record)] = 1.0
+    columns = np.column_stack([*each, begin])
     if torque > 0:
-        # White torque of `torque` volts held for a sample, as intensity on the acceleration.
-        par, _ = structure.internal(z)
-        ratio = (torque / par[1]) ** 2 * step / noise[0, 0]
-        relative = noise[1, 1] / noise[0, 0] if current else 0.0
-        gain, scale = kalman_gain(structure, z, ANGLE, step, ratio, relative)
-        noise = scale * noise[0, 0] if current else np.diag([scale[0, 0] * noise[0, 0], 1.0])
-    z = structure.complete(z)
-    start = np.zeros((1, 5))
-    here = evaluate(data, structure, z, start, start, NoiseModel(noise, gain))
-    cov = np.linalg.inv(here.normal)
-    m = structure.matrix
-    known = structure.combinations(z)
-    names = list(COMBINATIONS)
-    if current:
-        known |= physical_gradients(z)
-        names += PHYSICAL[:5]
-    rows = {n: (known[n][0], known[n][1] @ m) for n in names}
-    return {n: (value, float(row @ cov @ row)) for n, (value, row) in rows.items()}
+        columns = whitened(columns, record, motor, torque)
+    scale = np.linalg.norm(columns, axis=0)
+    triangle = np.linalg.qr(columns / scale, mode="r")
+    inverse = np.linalg.inv(triangle) / scale[:, None]
+    return (inverse @ inverse.T)[:-1, :-1]
+
+
+def whitened(
+    columns: np.ndarray, record: Record, motor: MotorParameters, torque: float
+) -> np.ndarray:
+    """Return columns divided by the root of the noise's covariance, a load's among it."""
+    n = len(record)
+    push = np.zeros(n)
+    push[1] = torque * motor.motor_constant / motor.resistance
+    free = replace(motor, coulomb_friction=0.0)  # it slides nearly always
+    answer = simulated(free, record.time, np.zeros(n), push)
+    outputs = [answer[:, 2] / (QUANTUM / np.sqrt(12)), answer[:, 0] / CURRENT_NOISE]
+    outputs = outputs[: len(columns) // n]
+    moved = np.concatenate([toeplitz(np.append(x[1:], 0.0), np.zeros(n)) for x in outputs])
+    root = np.linalg.cholesky(np.eye(len(columns)) + moved @ moved.T)
+    return solve_triangular(root, columns, lower=True)
+
+
+def simulated(
+    motor: MotorParameters, time: np.ndarray, voltage: np.ndarray, load: np.ndarray | None = None
+) -> np.ndarray:
+    """Return current, speed and angle by the simulator that recorded."""
+    values = [getattr(motor, n) for n in PHYSICAL]
+    nothing = np.zeros(time.size) if load is None else load
+    return independent.simulate(time, voltage, *values, nothing, substeps(motor, time[1] - time[0]))
+
+
+def bound(record: Record, motor: MotorParameters, torque: float) -> dict[str, tuple[float, float]]:
+    """Return the truth and the Cramer-Rao variance of every quantity, at the truth."""
+    # Voltage and speed leave one direction open, which R is taken for.
+    names = PHYSICAL if record.current is not None else PHYSICAL[1:]
+    cov = covariance(record, motor, names, torque)
+    out = {}
+    for quantity in (*COMBINATIONS, *(PHYSICAL[:5] if record.current is not None else ())):
+        true = getattr(motor, quantity)
+        gradient = np.array([
+            (getattr(replace(motor, **{n: (1 + VARIED) * getattr(motor, n)}), quantity) - true)
+            / VARIED
+            for n in names
+        ])  # fmt: skip
+        out[quantity] = true, float(gradient @ cov @ gradient)
+    return out
 
 
 def realisation(wheel: str, kind: str, current: bool, seed: int, args) -> dict:
-    """Return one estimate beside truth and bound, as a line of the file."""
-    record, z = recording(
+    """Return one estimate with truth and bound, as a line of the file."""
+    record, motor = recording(
         TABLE_1[wheel], kind, current=current, seed=seed, seconds=args.seconds,
         torque_noise=args.torque, static_voltage=0.3,
     )  # fmt: skip
-    limits = bound(record, z, current, args.torque)
+    limits = bound(record, motor, args.torque)
     line = {"case": [wheel, kind, current], "seed": seed, "torque": args.torque,
             "model": args.model}  # fmt: skip
     model = "auto"

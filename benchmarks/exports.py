@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Do exported gains do in the target's own arithmetic what their comment says?
 
     python benchmarks/exports.py [--motors 50]
@@ -87,7 +88,7 @@ def arduino_pid(n: Mapping[str, float], T: float) -> Law:
 
 
 def roboclaw(n: Mapping[str, float], T: float) -> Law:
-    """The set-point fed forward by QPPS, the duty as a share of it, as far as is known."""
+    """Feed the set-point forward by QPPS, with the duty as a share of it, by the documentation."""
     total = 0.0
 
     def law(r: float, y: float, counts: int) -> float:
@@ -149,7 +150,7 @@ def attempt(name: str, motor) -> tuple[float, ...] | None:
     found = check(one, gains)
     change = 0.5 * one.reference.max_velocity
     t, speed = run(motor, LAWS[name](gains.numbers, T), T, change, duration(one, gains))
-    # A tick of the encoder beside what whole numbers leave.
+    # A tick of the encoder plus the rounding to whole numbers
     band = max(0.02, found.resting_error + 2 * math.pi / COUNTS / T / change)
     # As specified: within half a percent of the band, from 1.2 times the settling time on.
     specified = found.step.settling
@@ -165,14 +166,16 @@ def attempt(name: str, motor) -> tuple[float, ...] | None:
 def median(values: np.ndarray) -> str:
     """Return the median of those that settle, and of how many."""
     there = values[np.isfinite(values)]
-    rests = "" if there.size == values.size else f", {values.size - there.size} rest beside it"
-    return f"{1e3 * np.median(there):.0f} ms{rests}" if there.size else "rests beside it"
+    rests = "" if there.size == values.size else f", {values.size - there.size} with an error"
+    return f"{1e3 * np.median(there):.0f} ms{rests}" if there.size else "remaining error"
 
 
 def main() -> int:
     """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--motors", type=int, default=50, help="random ones beside the paper's")
+    parser.add_argument(
+        "--motors", type=int, default=50, help="random ones in addition to the paper's"
+    )
     motors = [*TABLE_1.values(), *random_motors(parser.parse_args().motors)]
     print("| format | designed | settling specified | simulated | overshoot specified | simulated"
           " | largest difference | settles as specified | Ms |")  # fmt: skip

@@ -1,10 +1,11 @@
+# SPDX-License-Identifier: Apache-2.0
 """Faults drawn at random against real processes: no forbidden motion, no dead node.
 
     python benchmarks/faults.py                         # one hour, seed of the day
     python benchmarks/faults.py --minutes 2 --seed 7
     python benchmarks/faults.py --parameters 5000       # sets through the service of a live wheel
 
-Faults come singly or in pairs, at set-points drawn too.  What is allowed is the table of
+Faults come singly or in pairs, at random set-points.  The allowed outcomes are in
 docs/decisions/when-a-wheel-stops.md: a fault that stops must have done so in its time, with half
 a second for a busy machine; after that the motor gets nothing, or the small voltage of at most
 three tries; once it has passed, and a person has called ~/reset, the wheel drives again.
@@ -39,7 +40,7 @@ WHEEL = "front_left"
 NODE = f"{WHEEL}/wheel_pid"
 SUPPLY, SLACK = 12.0, 0.5
 FASTEST = 5.0
-"""Speed of this wheel at its supply [rad/s], and what a coarse mean may add."""
+"""Speed of this wheel at its supply [rad/s], with a margin for a coarse mean."""
 TRY_VOLTAGE = 1.05 * 4.0 + 0.02  # and a step of the PWM
 
 
@@ -55,7 +56,7 @@ class Fault:
 
 
 class Campaign:
-    """Plant, relay and wheel, and what is asked of them."""
+    """Plant, relay and wheel, with their commands."""
 
     def __init__(self, domain: int, through_relay: bool) -> None:
         from wheel_robot import Relay, WheelRobot
@@ -190,7 +191,7 @@ def _parameters(campaign: Campaign) -> None:
 
 BRAKES = 0.5 + 1.2
 BEHIND = 0.15
-"""Age of what the relay passes on [s] above which it is this process that is late."""
+"""Age of relayed messages [s] above which this process is late."""
 AGAIN, STARTS = 20.0, 90.0
 """Time to drive again [s]; to start a process takes three seconds of a processor that others may
 use, too."""
@@ -220,10 +221,10 @@ FAULTS = [
 
 
 def unsampled(commands: list[Any]) -> float:
-    """Return the time of which no sample reached the controller [s].
+    """Return the total time without a sample at the controller [s].
 
-    Of a gap between samples it takes 0.1 s for evidence and no more, so that on a processor which
-    it does not get a fault is found later by that.
+    A gap between samples counts as at most 0.1 s of evidence, so on a busy processor a fault is
+    found later.
     """
     stamps = [c.header.stamp.sec + 1e-9 * c.header.stamp.nanosec for c in commands]
     gaps = [b - a - 0.1 for a, b in pairwise(t for t in stamps if t)]
@@ -231,7 +232,7 @@ def unsampled(commands: list[Any]) -> float:
 
 
 def trial(campaign: Campaign, faults: list[Fault], duration: float) -> str:
-    """Put faults in for a time; return what was forbidden, or nothing."""
+    """Inject faults for a time; return the forbidden outcome, empty if none."""
     for fault in sorted(faults, key=lambda fault: not fault.of_the_relay):
         fault.begin(campaign)
     begin, begun = time.monotonic(), time.time()
@@ -353,7 +354,7 @@ def parameters(count: int, seed: int, campaign: Campaign) -> bool:
 
 
 def main() -> int:
-    """Run what is asked for; exit code 1 where something forbidden happened."""
+    """Run the campaign; exit code 1 after a forbidden outcome."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--minutes", type=float, default=60.0)
     parser.add_argument("--seed", type=int, default=int(time.time()) // 86400)

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """``identify --fleet`` on a Dask cluster of two workers against one process: numbers, time, a kill.
 
     pip install distributed
@@ -5,10 +6,10 @@
     python benchmarks/fleet.py --bags 20
 
 Recordings of simulated motors are identified one after the other in this process, then by a local
-cluster of two workers of which one is killed half-way.  What must hold: every number is the same
-to the bit, nothing is lost, and the cluster without a kill is at least 1.6 times as fast.  The
-package is the installed one, whose compiled code lies on the disk: code that is compiled while it
-runs may add up in another order than what is loaded.
+cluster of two workers, one of them killed half-way.  All numbers must be equal to the bit, no
+result may be lost, and the cluster without a kill must be at least 1.6 times as fast.  The package
+is the installed one with its compiled code on the disk: code compiled while running may sum in
+another order than loaded code.
 """
 
 from __future__ import annotations
@@ -75,7 +76,7 @@ def by_two(paths: list[str], settings: tuple[Any, ...], kill: bool) -> tuple[Any
 
 
 def warm(cluster: Any, settings: tuple[Any, ...], paths: list[str]) -> None:
-    """Let every worker load what it computes with, as this process has."""
+    """Let every worker load its modules, as this process has."""
     from dask.distributed import Client
 
     with Client(cluster) as client:

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Outcomes of a fixed set of records, kept in ``frozen.json``, against those of today's code.
 
 The set is `world` (every effect in every strength) and clean records of `world` (``baseline``), all
@@ -17,6 +18,7 @@ import json
 import sys
 import time
 from collections import Counter
+from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 
@@ -25,14 +27,33 @@ import world
 from world_effects import EFFECTS
 from world_record import case
 
+Job = tuple[int, int, int]
 KEPT = Path(__file__).with_name("frozen.json")
 GOOD = ("right", "covered")
 WRONG = ("silent", "warned", "crash")
+MOVED = 0.2  # deviations by which a number that changed has moved
 SHARP = 0.05  # relative random standard deviation of a sharp number, times 2
 
 
-def identify(job: tuple[int, int, int]) -> tuple[str, dict[str, object]]:
-    """Estimate one record of the set; return its key and what is kept."""
+def jobs(words: Sequence[str] = (), each: int = 2, clean: int = 60, seed: int = 0) -> list[Job]:
+    """Return effect, strength and seed of every record of the set."""
+    base = 1_000_003 * seed
+    out = [
+        (k, level, base + 1000 * k + 10 * n + level)
+        for n in range(each)
+        for k, e in enumerate(EFFECTS)
+        for level in range(3)
+        if k and (not words or any(w in e.name.lower() for w in words))
+    ]
+    if not words or "baseline" in words:
+        out += [(0, n % 3, base + 500_000 + n) for n in range(clean)]
+    return out
+
+
+def identify(
+    job: Job, progress: Callable[[str], None] | None = None
+) -> tuple[str, dict[str, object]]:
+    """Estimate one record of the set; return its key and the stored values."""
     from smp_motor_ident.errors import SmpError
     from smp_motor_ident.estimate import estimate
 
@@ -45,7 +66,7 @@ def identify(job: tuple[int, int, int]) -> tuple[str, dict[str, object]]:
     about = f"{c.kind} {c.rate:g}Hz n{c.samples} {c.signals}{' current' if c.current else ''}"
     begin = time.process_time()
     try:
-        e = estimate(record)
+        e = estimate(record, progress=progress)
     except SmpError as refusal:
         outcome = "right" if effect.expect == "refuse" else "refused"
         return key, _row(outcome, about, begin, message=str(refusal)[:200])
@@ -88,7 +109,7 @@ def summary(rows: dict[str, dict]) -> str:
         counts = Counter(r["outcome"] for r in part.values())
         cpu = np.array([r["cpu"] for r in part.values()])
         notes = [len(r.get("codes", ())) for r in part.values()]
-        sharp = sum(_is_sharp(r) for r in part.values())
+        sharp = sum(is_sharp(r) for r in part.values())
         lines.append(
             f"{title}: {n} records; "
             + ", ".join(f"{k} {v}" for k, v in counts.most_common())
@@ -114,11 +135,24 @@ def summary(rows: dict[str, dict]) -> str:
     return "\n".join(lines)
 
 
-def _is_sharp(row: dict) -> bool:
+def is_sharp(row: dict) -> bool:
     """Tell whether gain and time constant are right and stated to 5 % (random)."""
     numbers = row.get("numbers", {})
     both = [numbers.get(name) for name in ("dc_gain", "time_constant")]
     return row["outcome"] in GOOD and all(b and 1.96 * b[1] < SHARP for b in both)
+
+
+def rank(row: dict) -> tuple[int, bool]:
+    """Return how good an outcome is, 0 being best."""
+    kind = 2 if row["outcome"] in WRONG else int(row["outcome"] not in GOOD)
+    return kind, not is_sharp(row)
+
+
+def differs(one: dict, other: dict) -> bool:
+    """Tell whether outcome or numbers are others."""
+    a, b = one.get("numbers", {}), other.get("numbers", {})
+    moved = (max(abs(x[k] - b[n][k]) for k in (0, 1)) > MOVED * x[1] for n, x in a.items())
+    return one["outcome"] != other["outcome"] or set(a) != set(b) or any(moved)
 
 
 def compare(before: dict[str, dict], now: dict[str, dict]) -> str:
@@ -147,19 +181,9 @@ def main() -> None:
     parser.add_argument("--list", action="store_true")
     args = parser.parse_args()
     words = [w.strip().lower() for w in args.effects.split(",") if w.strip()]
-    base = 1_000_003 * args.seed
-    jobs = [
-        (k, level, base + 1000 * k + 10 * n + level)
-        for n in range(args.world)
-        for k, e in enumerate(EFFECTS)
-        for level in range(3)
-        if k and (not words or any(w in e.name.lower() for w in words))
-    ]
-    if not words or "baseline" in words:
-        jobs += [(0, n % 3, base + 500_000 + n) for n in range(args.clean)]
     rows: dict[str, dict] = {}
     with ProcessPoolExecutor(args.processes) as pool:
-        for key, row in pool.map(identify, jobs):
+        for key, row in pool.map(identify, jobs(words, args.world, args.clean, args.seed)):
             rows[key] = row
             if args.list:
                 print(f"{row['outcome']:8} {row['cpu']:6.1f} s {key} {row['about']} "

@@ -1,4 +1,5 @@
-"""Spoilt files of every format: what is made of them, in a table.
+# SPDX-License-Identifier: Apache-2.0
+"""Read damaged files of every format, and print the outcomes in a table.
 
     python benchmarks/fuzz.py [--files 20000] [--seed 1] [--formats mcap csv ...]
 
@@ -41,7 +42,7 @@ from backports import zstd
 from rosbags.rosbag1 import Writer as Ros1Writer
 from rosbags.typesys import Stores, get_typestore
 
-from smp_motor_control.parameter_file import written
+from smp_motor_control.parameter_file import format_parameters
 from smp_motor_ident.bag import list_topics, load, read_records
 from smp_motor_ident.cli.tune import main as main_of_tune
 from smp_motor_ident.errors import BagError, SignalError
@@ -221,7 +222,7 @@ def _identification() -> bytes:
 
 def _motors() -> bytes:
     motor = {"dc_gain": 25.0, "time_constant": 0.05, "gear_ratio": 65.5, "supply_voltage": 12.0}
-    return written({"/**/motor_plant": {"motors": {"left": motor}}}).encode()
+    return format_parameters({"/**/motor_plant": {"motors": {"left": motor}}}).encode()
 
 
 def _metadata() -> bytes:
@@ -268,7 +269,7 @@ SEEDS: dict[str, tuple[str, Callable[[], bytes], list[str] | None]] = {
     "mapping": ("map.yaml", lambda: b"motors:\n  left: {voltage: /pwm.data, velocity: y}\n", None),
     "msg": ("Float64.msg", lambda: b"float64 data\nFloat64[<=3] more\nuint8 X=1\n", MESSAGES),
 }
-"""File name, its sound bytes, and the mapping, by what is fuzzed."""
+"""File name, its sound bytes, and the mapping, by format."""
 
 EXTREME = [
     *(struct.pack("<I", v) for v in (0, 1, 0x7FFFFFFF, 0x80000000, 0xFFFFFFFF)),

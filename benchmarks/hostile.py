@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Files of at most 10 MB that claim far more than they hold, several for every reader.
 
     python benchmarks/hostile.py [NAME ...]
@@ -35,7 +36,7 @@ COUNTS = ["voltage=u", "count=y", "time=t", "counts_per_revolution=2000"]
 TOPICS = ["voltage=/u.x", "velocity=/y.x"]
 
 Case = tuple[str, Callable[[Path], object], list[str]]
-"""What is read, what writes it into an empty folder, and how it is mapped."""
+"""Name of the file, the function that writes it into an empty folder, and its mapping."""
 
 
 def text(name: str, whole: Callable[[], str], mapping: list[str] = COLUMNS) -> Case:
@@ -105,7 +106,7 @@ JSON: dict[str, Case] = {
 
 
 def sheet(part: str, *, head: str = "", repeat: str = "", times: int = 0) -> Case:
-    """Return a workbook by what stands behind some sound rows, and how often."""
+    """Return a workbook of some sound rows followed by repeated text."""
     cells = "".join(f'<c r="{c}1" t="inlineStr"><is><t>{c}</t></is></c>' for c in "TUY")
     sound = "".join(
         f'<row r="{k}"><c r="T{k}"><v>{k}</v></c><c r="U{k}"><v>{k % 5}</v></c>'
@@ -298,7 +299,7 @@ def wide_entries() -> bytes:
     )
 
 
-OTHERS: dict[str, Case] = {
+OTHER_WRITERS: dict[str, Case] = {
     "ros1 many connections": ROS1(connections, TOPICS),
     "ros1 chunks in chunks": ROS1(chunks, TOPICS),
     "wpilog many entries": LOG(
@@ -335,7 +336,7 @@ def groups(file: h5py.File) -> None:
 
 
 def zeros(n: int, file: h5py.File, every: int = 1) -> None:
-    """Claim vectors of so many zeros, none of which is stored."""
+    """Declare vectors of so many zeros without storing them."""
     for k in range(every):
         file.create_dataset(f"t{k}", (n,), "f8", chunks=(10**6,))
 
@@ -371,7 +372,7 @@ def metadata(*parts: Callable[[], str] | str) -> Case:
 
 
 def aliases() -> str:
-    """Return ten lines that stand for 10^9 words."""
+    """Return ten lines that expand to 10^9 words."""
     inner = [",".join([f"*a{k - 1}" if k else "lol"] * 10) for k in range(9)]
     return lines(*(f"a{k}: &a{k} [{one}]" for k, one in enumerate(inner)), "")
 
@@ -428,7 +429,7 @@ PLACES: dict[str, Case] = {
 KINDS = dict(csv=CSV, json=JSON, xlsx=XLSX, mcap=MCAP, sqlite=SQLITE, mat=MAT, bag=BAG)
 CASES: dict[str, Case] = {
     **{f"{kind}: {name}": case for kind, some in KINDS.items() for name, case in some.items()},
-    **OTHERS,
+    **OTHER_WRITERS,
     **PLACES,
 }
 
@@ -450,7 +451,7 @@ for call in (lambda: list_topics(path), lambda: read_records(path, mapping)):
 
 
 def read(name: str) -> tuple[list[str], float, str]:
-    """Return the lines that come of a case, the memory [byte] it took, and what is wrong."""
+    """Return the output lines of a case, the memory [byte] it took, and its fault."""
     target, write, mapping = CASES[name]
     folder = Path(tempfile.mkdtemp())
     try:

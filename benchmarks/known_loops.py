@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Motors identified through known firmware loops, from set-points and speeds, against the truth.
 
     python benchmarks/known_loops.py                     # 20 random motors a loop

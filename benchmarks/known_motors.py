@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Recordings of known motors for the benchmarks of identification.
 
 The simulator (test/ident/independent.py) integrates in small fixed steps and shares nothing
@@ -16,12 +17,12 @@ sys.path[:0] = [str(ROOT), str(ROOT / "test" / "ident")]
 
 import independent  # noqa: E402
 
-from smp_motor_ident.model.physical import from_physical  # noqa: E402
+from smp_motor_control.motor.parameters import COMBINATIONS, PHYSICAL, MotorParameters  # noqa: E402
 from smp_motor_ident.record import Hardware, Record  # noqa: E402
 
 QUANTUM = 2 * np.pi / 500
 CURRENT_NOISE = 0.01
-EXACT = 0.0, 0.0  # accuracy of current and voltage: what the tables are about is scatter
+EXACT = 0.0, 0.0  # accuracy of current and voltage: the tables are about scatter
 TABLE_1 = independent.TABLE_1
 
 
@@ -58,9 +59,9 @@ def recording(
     amplitude: float = 12.0,
     seed: int = 0,
     counts: bool = True,
-    substeps: int = 0,
-) -> tuple[Record, np.ndarray]:
-    """Return a recording of a motor (R, L, K, J, b) and its true coordinates z."""
+    coarse: int = 0,
+) -> tuple[Record, MotorParameters]:
+    """Return a recording of a motor (R, L, K, J, b), and the motor."""
     rng = np.random.default_rng(seed)
     t = np.arange(int(seconds * rate)) / rate
     if kind == "all":
@@ -71,10 +72,9 @@ def recording(
         v = voltage(t, kind, amplitude, rng)
     r, el, k, j, b = parameters
     load = torque_noise * k / r * rng.standard_normal(t.size)
-    te, tm = el / r, r * j / (k + r * b / k)
-    fastest = min(te, tm / k if k else te)
-    steps = substeps or int(np.clip(20 / rate / max(fastest, 1e-6), 20, 2000))
-    out = independent.simulate(t, v, r, el, k, j, b, static_voltage * k / r, load, steps)
+    motor = motor_of(parameters, static_voltage)
+    steps = coarse or substeps(motor, 1 / rate)
+    out = independent.simulate(t, v, r, el, k, j, b, motor.coulomb_friction, load, steps)
     count = np.floor(out[:, 2] / QUANTUM + rng.uniform()).astype(np.int64)
     amps = out[:, 0] + CURRENT_NOISE * rng.standard_normal(t.size) if current else None
     hardware = Hardware(1.0, 500.0 if counts else None, 0, amplitude, None, *EXACT)
@@ -89,7 +89,25 @@ def recording(
         hardware=hardware,
         source="simulated",
     )
-    return made, from_physical(r, el, k, j, b, static_voltage * k / r)
+    return made, motor
+
+
+def substeps(motor: MotorParameters, step: float) -> int:
+    """Return the steps of the simulator within a sample."""
+    slow = motor.resistance * motor.inertia / (motor.a0 * motor.motor_constant)
+    fastest = min(motor.inductance / motor.resistance, slow)
+    return int(np.clip(20 * step / max(fastest, 1e-6), 20, 2000))
+
+
+def motor_of(parameters: tuple[float, ...], static_voltage: float) -> MotorParameters:
+    """Return the motor of R, L, K, J, b and the voltage at which it breaks loose."""
+    torque = static_voltage * parameters[2] / parameters[0]
+    return MotorParameters(**dict(zip(PHYSICAL, (*parameters, torque))))
+
+
+def truth_of(motor: MotorParameters) -> dict[str, float]:
+    """Return the true physical parameters and combinations of a motor by their names."""
+    return {name: getattr(motor, name) for name in (*PHYSICAL, *COMBINATIONS)}
 
 
 def table(head: tuple[str, ...], rows: list[tuple[object, ...]]) -> str:

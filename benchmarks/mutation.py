@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Small changes of the code that keeps wheels and readers safe: which does no test notice?
 
     python benchmarks/mutation.py                       # every module of the table, some hours
@@ -50,7 +51,6 @@ TESTS = {
     CONTROL + "wheel.acceptance": "control/test_acceptance.py",
     CONTROL + "body.odometry": "control/test_odometry.py",
     CONTROL + "body.command": "control/test_body_command.py",
-    "smp_motor_ident.estimation.selection": "ident/test_structure_choice.py",
     BAG + "counter": "ident/bag/test_counter.py",
     BAG + "salvage": "ident/bag/test_salvage.py",
     BAG + "unpack": "ident/bag/test_unpack.py",

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """How much quieter is the loop with the observer than with differenced counts?
 
 The same gains, so the same bandwidth, once fed with counts differenced over one sample and
@@ -41,7 +42,7 @@ LOAD = 0.5
 
 @dataclass(frozen=True)
 class Noise:
-    """What a way of measuring the speed does to the loop."""
+    """Effect of a speed source on the loop."""
 
     speed: float
     voltage: float
@@ -69,7 +70,7 @@ def gains_for(model: MotorModel, bandwidth: float) -> PidGains:
 
 
 def run(entry: MotorEntry, rate: float, observed: bool, duration: float, seed: int) -> Noise:
-    """Close the loop on one motor and measure what its speed source does to it."""
+    """Close the loop on one motor and measure the effect of its speed source."""
     dt = 1.0 / rate
     model = wrong_model(entry, seed)
     p = entry.parameters

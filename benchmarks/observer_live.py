@@ -1,10 +1,11 @@
+# SPDX-License-Identifier: Apache-2.0
 """The comparison of benchmarks/observer.py on live nodes: motor_plant and one wheel_pid.
 
 The plant reports the true speed (velocity_window 0), which the loop does not use; wheel_pid
 makes its speed from counts, differenced over one sample or observed, with the same gains. Its
 model is the plant's own with every number wrong by 1 %. The reference goes up and down a ramp,
-so that counts cannot lock to the sampling. Voltage noise is what is left of the command beside
-its mean over 0.1 s.
+so that counts cannot lock to the sampling. Voltage noise is the deviation of the command from its
+mean over 0.1 s.
 
     python benchmarks/observer_live.py [--rates 200 1000] [--duration 8]
 """
@@ -60,7 +61,7 @@ def parameters(entry: MotorEntry, rate: float, source: str) -> list[str]:
 
 
 class Probe:
-    """Sets the wheel's speed and keeps what the nodes say."""
+    """Set the wheel's speed and store the nodes' messages."""
 
     def __init__(self) -> None:
         rclpy.init(args=[], domain_id=DOMAIN)

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Reproduce the paper: writes docs/paper.md and its figures (``make paper``).
 
 Everything in the page is computed here: the plant is Table 1, simulated by steps that share no
@@ -74,7 +75,7 @@ def sampled(motor, loop):
 
 
 def record(wheel, wave, current):
-    """Return what a bag at 200 Hz holds of one motor of Table 1."""
+    """Return one motor of Table 1 as recorded in a bag at 200 Hz."""
     R, L, K, J, b = TABLE_1[wheel]
     T = 0.005
     time = T * np.arange(int(SECONDS / T) + 1)
@@ -162,7 +163,7 @@ def parameter_table(found):
 
 @dataclass(frozen=True)
 class Reading:
-    """What the gains of Table 2 multiply: the speed of the motor or of the wheel."""
+    """Interpretation of the gains of Table 2: of the speed of the motor or of the wheel."""
 
     name: str
     divisor: float
@@ -359,7 +360,7 @@ def combination_table():
 
 
 def gains_table(designs):
-    """Return our gains beside Table 2, both per rad/s of the wheel."""
+    """Return our gains and those of Table 2, both per rad/s of the wheel."""
     lines = [
         "| motor | Table 2: Kp, Ki, Kd | ours: Kp, Ki, Kd | phase margin | Ms "
         "| Table 2 at 200 Hz |",

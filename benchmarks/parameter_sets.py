@@ -1,4 +1,5 @@
-"""Random sets of parameters of a wheel: what is accepted must run and follow.
+# SPDX-License-Identifier: Apache-2.0
+"""Random sets of parameters of a wheel: accepted ones must run and follow.
 
     python benchmarks/parameter_sets.py 5000 --seed 15
 

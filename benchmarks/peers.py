@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What people write today to identify a motor, each as its own documentation would have it."""
 
 from __future__ import annotations
@@ -7,21 +8,17 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
-import known_motors  # noqa: F401 - puts the package on the path
 import numpy as np
+from known_motors import independent
 from scipy.optimize import least_squares
 from scipy.signal import cont2discrete, lfilter
 
-from smp_motor_ident.estimation.fit import Start, solve
-from smp_motor_ident.likelihood.experiments import prepare
-from smp_motor_ident.model.coordinates import Coordinates
-from smp_motor_ident.model.structures import SecondOrder
+from smp_motor_control.motor.parameters import PHYSICAL, MotorParameters
 from smp_motor_ident.record import Record
 
 GUESS = (0.1, 1e-2, 1e-4)
 """a0 [V s/rad], a1 [V s^2/rad], a2 [V s^3/rad] of the start: a motor that turns at 120 rad/s at
 12 V with time constants of about 0.1 and 0.01 s, round numbers, 2.5 to 6 times off here."""
-NOISE = 4.0  # (rad/s)^2, a scale for the sums
 SMOOTH = 1.0  # rad/s within which a smooth friction changes sign
 OPTIMISED = ("-O3", "-march=native")
 STEPS = 10  # of Runge-Kutta per sample, as in CasADi's example
@@ -45,7 +42,7 @@ set_up = [0.0, 0.0]
 
 @contextlib.contextmanager
 def _setting_up() -> Iterator[None]:
-    """Count what is done inside as building."""
+    """Count the time inside as set-up."""
     begun, spent = time.perf_counter(), time.process_time()
     yield
     set_up[0] += time.perf_counter() - begun
@@ -53,7 +50,7 @@ def _setting_up() -> Iterator[None]:
 
 
 def cost(record: Record, x: np.ndarray) -> float:
-    """Return the sum of squared residuals of coordinates, the initial state being free.
+    """Return the sum of squared errors of a motor's speed, simulated independently from rest.
 
     Parameters
     ----------
@@ -69,13 +66,15 @@ def cost(record: Record, x: np.ndarray) -> float:
     """
     if not np.all(np.isfinite(x)):
         return float("nan")
-    fixed = dict(zip(("ln_a0", "ln_a1", "ln_a2", "vc_plus"), map(float, x)))
-    structure = SecondOrder(friction="symmetric" if len(x) > 3 else "none", fixed=fixed)
-    data = prepare([record], False)
-    return (
-        solve(data, structure, Start(Coordinates(), data.initial, NOISE * np.eye(2))).objective
-        * NOISE
-    )
+    a0, a1, a2 = np.exp(x[:3])
+    motor = MotorParameters.from_combinations(
+        dc_gain=1 / a0, time_constant=a1 / a0, time_constant_product=a2 / a0,
+        static_voltage=x[3] if len(x) > 3 else 0.0,
+    )  # fmt: skip
+    values = [getattr(motor, name) for name in PHYSICAL]
+    still = np.zeros(len(record))
+    speed = independent.simulate(record.time, record.voltage, *values, still, 20)[:, 1]
+    return float(np.square(record.velocity - speed).sum())
 
 
 def _ahead(record: Record) -> np.ndarray:

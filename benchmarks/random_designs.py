@@ -1,12 +1,12 @@
+# SPDX-License-Identifier: Apache-2.0
 """Does any ordinary motor at any rate end tune in anything but gains or a reasoned refusal?
 
     python benchmarks/random_designs.py [--count 5000] [--seed 1] [--jobs 2]
 
 Motors of L/R from 10 us to 10 ms and mechanical time constants from 5 ms to 1 s, at 20 Hz to 5 kHz,
 with 11 to 4096 counts, reported, differenced and observed speed, with and without averaging, sensor
-lag and delay.  What a design states is run by the loop's own simulation; an exception that is no
-DesignError, a number that is not finite, an unstable loop and parameters that the running loop
-does not take count as crashes.
+lag and delay.  The loop's own simulation checks a design; an exception other than DesignError, a
+non-finite number, an unstable loop and parameters that the running loop refuses count as crashes.
 """
 
 from __future__ import annotations

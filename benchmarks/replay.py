@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A bag through ``play`` into ``identifier``: its last answer against the offline intervals.
 
     python benchmarks/replay.py demo_output        # of make demo: excitation and identification

@@ -1,10 +1,11 @@
-"""What the tools take from the shell, now and before the redesign, in turn in one run.
+# SPDX-License-Identifier: Apache-2.0
+"""Times of the tools from the shell, now and before the redesign, alternating in one run.
 
     python benchmarks/shell.py demo_output/excitation     # of make demo
     python benchmarks/shell.py BAG --against COMMIT --runs 7
 
 Medians of wall and processor time (children included) of ``identify --help`` and of ``identify``
-with its report, this version's and a commit's, which is checked out beside it and compiled first.
+with its report, of this version and of a commit, which is checked out and compiled first.
 """
 
 from __future__ import annotations
@@ -56,7 +57,7 @@ def main() -> int:
             for tree in (ROOT, old):
                 for package in ("smp_motor_control", "smp_motor_ident"):
                     compileall.compile_dir(tree / package, quiet=2)
-                run(tree, *calls["identify BAG"])  # compiles what is compiled on its first call
+                run(tree, *calls["identify BAG"])  # compiles functions on their first call
             print(f"{'':18}{'now':>16}{asked.against:>18}{'ratio':>16}")
             for name, arguments in calls.items():
                 took = [(run(ROOT, *arguments), run(old, *arguments)) for _ in range(asked.runs)]

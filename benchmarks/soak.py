@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Soak: plant at 200 Hz, four wheel controllers and skid_steer, driving for a long time.
 
     python benchmarks/soak.py               # 20 minutes
@@ -118,7 +119,7 @@ class Driver:
 
 
 def soak(minutes: float, processes: dict[str, subprocess.Popen[bytes]]) -> bool:
-    """Drive, watch, and print what was found."""
+    """Drive, watch, and print the findings."""
     driver = Driver()
     driver.spin(10.0)
     driver.counting = True

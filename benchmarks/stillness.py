@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """When the machine itself stood still: a witness on every processor, above all that is measured.
 
 A virtual machine is now and then not run for some milliseconds.  Nothing in it can keep time

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Timing of ``wheel_pid`` against a bare node that only echoes, in one run.
 
     python benchmarks/timing.py                 # everything, about four minutes
@@ -51,7 +52,7 @@ GAINS = {
 
 
 def echo(priority: int) -> None:
-    """Be the bare node: what is the least that rclpy can do per sample."""
+    """Run a bare node: the minimum work of rclpy per sample."""
     if priority:
         os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(priority))
     import rclpy
@@ -91,8 +92,8 @@ class Result:
 class Feeder:
     """Publishes feedback and set-points of some wheels and notes when the answers came in.
 
-    The middleware stamps an answer when it receives it; the feeder takes them between two ticks,
-    so that it does not stand in the way of those whom it measures.
+    The middleware stamps an answer on arrival; the feeder takes them between two ticks, so it does
+    not disturb the measured nodes.
     """
 
     def __init__(self, wheels: list[str]) -> None:
@@ -283,15 +284,15 @@ def real_time_granted() -> bool:
 
 
 def wheels(rate: float, duration: float, priority: int) -> bool:
-    """Measure four wheels at once beside four bare nodes; the feeder gives way to them."""
+    """Measure four wheels and four bare nodes at once, with the feeder at a lower priority."""
     from smp_motor_control import WHEELS
-    from smp_motor_control.nodes.wheel_pid import keep_time
+    from smp_motor_control.nodes.wheel_pid import request_real_time
 
     if priority and not real_time_granted():
         print("  the system grants no real-time priority: running without")
         priority = 0
     feeder = Feeder(list(WHEELS))
-    keep_time(feeder.node, max(0, priority - 1), ())
+    request_real_time(feeder.node, max(0, priority - 1), ())
     results = {
         kind: measure(feeder, kind, rate, duration, priority) for kind in ("echo", "wheel_pid")
     }
@@ -324,7 +325,7 @@ def core() -> bool:
 
 
 def main() -> int:
-    """Run what is asked for; exit code 1 where a limit is broken."""
+    """Run the measurements; exit code 1 if a limit is exceeded."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--only", choices=("echo", "wheels", "core"))
     parser.add_argument("--rate", type=float, default=500.0, help="of the comparison [Hz]")

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Do four unlike wheels under uneven load reach their speed at the same time?
 
 Each motor of the paper is excited and recorded into a bag; identified from that bag; given
@@ -60,13 +61,13 @@ DELAY = 0.0005
 """From a sample to the voltage that answers it [s]."""
 
 TRANSITION = 0.25
-"""Of the common reference [s]; what the slowest wheel's design asks for, and some reserve."""
+"""Of the common reference [s]: that of the slowest wheel's design, with some reserve."""
 
 TORQUE_NOISE = 1e-3
 """Random load, as a share of each motor's torque per volt [V sqrt(s)].
 
-It moves the free motor by 0.1 % of the step (rms); what is beyond a plain 0.5 % of overshoot at
-1 kHz is this noise, which grows with it: three times as much makes 1.3 %."""
+It moves the free motor by 0.1 % of the step (rms), and increases the overshoot at 1 kHz beyond
+0.5 %: three times the load gives 1.3 %."""
 
 
 @dataclass(frozen=True)
@@ -93,7 +94,7 @@ class Arrival:
 def record(
     entries: Mapping[str, MotorEntry], folder: Path, rate: float, duration: float, seed: int
 ) -> None:
-    """Excite every motor, and record what its hardware reports into a bag."""
+    """Excite every motor, and record its hardware's reports into a bag."""
     excitation = Fourier(amplitude=10.0)
     start = 1_700_000_000_000_000_000
     with BagWriter(folder) as bag:

@@ -1,9 +1,10 @@
+# SPDX-License-Identifier: Apache-2.0
 """Do four unlike wheels arrive together on live nodes?  motor_plant, four wheel_pid, DDS.
 
 The motors are identified from a recorded bag (see benchmarks/together.py), the gains and the
 common reference designed by ``design_wheels`` from that, written as ``tune`` writes them, and
 loaded by the nodes.  Steps from rest to 100 rad/s of the motors and back to rest; the true
-speed, which the loop does not use, is what the plant reports (velocity_window 0).
+speed, which the loop does not use, is that of the plant (velocity_window 0).
 
     python benchmarks/together_live.py [--rates 100 200 1000] [--steps 6]
 
@@ -72,7 +73,7 @@ class Step:
 
 
 class Probe:
-    """Asks all wheels for the same speed, and keeps what they did."""
+    """Give all wheels the same set-point, and store their speeds."""
 
     def __init__(self, wheels: Sequence[str]) -> None:
         rclpy.init(args=[], domain_id=DOMAIN)
@@ -106,13 +107,13 @@ class Probe:
             self.executor.spin_once()
 
     def forget(self) -> None:
-        """Take in what has come, and drop it."""
+        """Take pending messages and drop them."""
         self.catch_up()
         for seen in (*self.states.values(), *self.asked.values()):
             seen.clear()
 
     def catch_up(self) -> None:
-        """Spin until what was sent by now is here."""
+        """Spin until all messages sent so far have arrived."""
         now = runtime.seconds(self.node.get_clock().now().to_msg())
         end = time.monotonic() + 5.0
         while time.monotonic() < end and not all(

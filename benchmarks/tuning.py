@@ -1,9 +1,10 @@
+# SPDX-License-Identifier: Apache-2.0
 """Do the designed loops keep the margins they require?  Every method, 4 + N motors, four rates.
 
     python benchmarks/tuning.py [--motors 200] [--jobs 2] [--rates 100 200] [--output FILE]
 
-What was done already is read from FILE, a line of JSON for each motor and rate, and not done
-again: the run may be ended and taken up.
+Finished results are read from FILE, a line of JSON for each motor and rate, so an interrupted run
+can be resumed.
 
 Each design is run by ``closed_loop``, which shares no code with the designer: counts, clamp and
 delay included.  A margin is confirmed by spending it: at 95 % of gain and delay margin
@@ -76,7 +77,7 @@ def combinations(motor):
 
 
 def estimate_of(motor) -> Estimate:
-    """Return what an identification of this motor may have said, without error of its own."""
+    """Return an error-free identification of this motor."""
     a0, a1, a2 = combinations(motor)
     values = {"dc_gain": 1 / a0, "time_constant": a1 / a0, "time_constant_product": a2 / a0}
     return Estimate(
@@ -91,7 +92,7 @@ def estimate_of(motor) -> Estimate:
 
 @dataclass
 class Outcome:
-    """What one design of one motor at one rate did."""
+    """Result of one design of one motor at one rate."""
 
     rate: float
     method: str
@@ -198,7 +199,7 @@ def check(job) -> list[Outcome]:
 
 
 def try_design(outcome: Outcome, motor, one: Design, conditions, estimate) -> None:
-    """Fill in what the independent simulation says of one design."""
+    """Fill in the independent simulation of one design."""
     controller, m = from_gains(one.gains), one.margins
     target = 0.5 * SUPPLY / combinations(motor)[0]
     outcome.settling, outcome.overshoot, speed = step(motor, controller, conditions, target, one)
@@ -234,7 +235,7 @@ def try_design(outcome: Outcome, motor, one: Design, conditions, estimate) -> No
 
 
 def compare_with_rules(outcome: Outcome, motor, one: Design, conditions, estimate, loop) -> None:
-    """Set the recommended design beside SIMC and Ziegler-Nichols at the same Ms."""
+    """Compare the recommended design with SIMC and Ziegler-Nichols at the same Ms."""
     plant = sample(motors_of(estimate), loop)
     top = SUPPLY / combinations(motor)[0]
     ours = {share: step(motor, from_gains(one.gains), conditions, share * top, one)[0]
@@ -313,18 +314,18 @@ def known_and_unknown(rates) -> None:
                 one, other = (design(each, loop, method).gains for each in (known, true))
                 for name in ("p", "i", "feedforward_velocity", "feedforward_acceleration"):
                     worst = max(worst, abs(getattr(one, name) / getattr(other, name) - 1))
-    print(f"\ngains from combinations alone, beside those from all parameters: within {worst:.1e}")
+    print(f"\ngains from combinations alone, relative to those from all: within  {worst:.1e}")
 
 
 def remembered(file: Path | None) -> dict[tuple[int, float], list[Outcome]]:
-    """Return what a file holds of earlier runs, by motor and rate."""
+    """Return the results of earlier runs in a file, by motor and rate."""
     if file is None or not file.exists():
         return {}
     found: dict[tuple[int, float], dict[str, Outcome]] = {}
     for text in file.read_text().splitlines():
         line = json.loads(text)
         of = found.setdefault((line["motor"], line["rate"]), {})
-        # A later line replaces what it holds of an earlier one.
+        # A later line replaces the same methods of an earlier one.
         of.update({each["method"]: Outcome(**each) for each in line["outcomes"]})
     return {key: list(of.values()) for key, of in found.items()}
 

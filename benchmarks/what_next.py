@@ -1,7 +1,9 @@
-"""Whether the proposed excitation brings what it predicts: recorded, identified, compared.
+# SPDX-License-Identifier: Apache-2.0
+"""Check whether the proposed excitation brings the predicted accuracy.
 
-Each motor of Table 1 is recorded without current, identified, and asked what to record next; the
-proposal is simulated with the `excite` node's own Fourier voltage and identified from cold.
+Each motor of Table 1 is recorded without current and identified, with a proposal for the next
+recording; the proposal is simulated with the `excite` node's own Fourier voltage and identified
+from cold.
 
 Usage: python benchmarks/what_next.py [--accuracy 0.01] [--recordings 5]
 """
@@ -11,12 +13,11 @@ from __future__ import annotations
 import argparse
 
 import numpy as np
-from known_motors import CURRENT_NOISE, QUANTUM, TABLE_1, independent, recording, table
+from known_motors import CURRENT_NOISE, QUANTUM, TABLE_1, independent, recording, table, truth_of
 
 from smp_motor_control.excitation import Fourier
-from smp_motor_ident.diagnosis.identifiability import what_next
 from smp_motor_ident.estimate import estimate
-from smp_motor_ident.model.physical import physical
+from smp_motor_ident.infer.planning import what_next
 from smp_motor_ident.record import Hardware, Record
 
 
@@ -48,9 +49,11 @@ def main() -> None:
     args = parser.parse_args()
     rows = []
     for wheel, p in TABLE_1.items():
-        first, z = recording(p, "all", current=False, static_voltage=args.friction, seconds=10.0)
+        first, motor = recording(
+            p, "all", current=False, static_voltage=args.friction, seconds=10.0
+        )
         proposal = what_next(estimate(first), args.accuracy, current_noise=CURRENT_NOISE)
-        truth = physical(z)
+        truth = truth_of(motor)
         stated: dict[str, list[float]] = {}
         errors: dict[str, list[float]] = {}
         for seed in range(args.recordings):

@@ -1,9 +1,10 @@
+# SPDX-License-Identifier: Apache-2.0
 """Recordings with the effects of real drives: right, named, refused, or silently wrong.
 
 An independent simulator (`world_motor`) records random motors with one of the effects of
 `world_effects` in one of three strengths; every estimate is held against the truth.  ``right``:
 no number off by more than 5 of its standard deviations and 2 %, and nothing called unreliable;
-``covered``: so because of what is taken of instruments that the records do not show.
+``covered``: so because of the assumed systematic errors of instruments.
 ``cause``: called unreliable, with the effect named; ``other``: with another cause, or none.
 ``silent``: off by more than that and not called unreliable; ``warned`` where at least a warning
 names the effect, or a note names every number that is off.

@@ -1,13 +1,14 @@
-"""Do gains from recordings with the effects of real drives keep on those drives what they state?
+# SPDX-License-Identifier: Apache-2.0
+"""Check that gains from recordings with the effects of real drives keep their specification.
 
     python benchmarks/world_loops.py [--motors 3] [--seed S] [--effects NAME,...] [--processes 2]
                                      [--rich] [--list]
 
 Each case of ``world`` is recorded, identified and tuned as the tools do it without arguments.  The
 wheel's own loop then changes its speed on the simulated drive, with the same effects in driver,
-motor and sensor, by what ``gains.json`` speaks of, from a set-point of zero.  ``kept``: overshoot
-and settling within the stated bands, with what is tolerated of each (`OVER`, `LATE`); ``declined``:
-no estimate, one that ``tune`` refuses, or a recording of which a refusal alone is right;
+motor and sensor, by the change in ``gains.json``, from a set-point of zero.  ``kept``: overshoot
+and settling within the stated bands and tolerances (`OVER`, `LATE`); ``declined``: no estimate, one
+that ``tune`` refuses, or a recording that must be refused;
 ``unstated``: the gains state no largest settling time, and keep the rest.
 """
 
@@ -117,14 +118,14 @@ def changed_speed(c: Case, design, rng: np.random.Generator) -> tuple[np.ndarray
     drive = Drive(c, samples, c.step, rng)  # answers take a sample, as designs assume
     encoder = Encoder(c.turn, 0) if c.signals != "speed" else None
     loop = WheelLoop(
-        loop_settings(parameters(design)).within(c.motor.supply), Gearbox(ratio), encoder,
+        loop_settings(parameters(design)).clamp_to_supply(c.motor.supply), Gearbox(ratio), encoder,
         1.5 * c.motor.supply,
     )  # fmt: skip
     loop.start(0.0)
     command = 0.0
     for k in range(samples):
         velocity, count = drive.sample(k)
-        # What the driver ran over the last interval is the answer to the sample before that.
+        # The voltage over the last interval is the response to the sample before it.
         ran = drive.command[k - 2] if k > 1 else 0.0
         speed = loop.speed(c.step, velocity / ratio, count, ran)
         if not np.isnan(speed):

@@ -1,9 +1,10 @@
-"""A drive with what real drives have, simulated piece by piece in closed form.
+# SPDX-License-Identifier: Apache-2.0
+"""A drive with the effects of real drives, simulated piecewise in closed form.
 
 Between two events (a command, a PWM edge, a reversal, the end of a conduction) winding and rotor
 are linear and solved exactly; reversals and the end of a conduction are located by bisection.
-What depends smoothly on speed and angle is evaluated at the middle of each fine step.  Knows
-nothing of the package that it judges.
+Smooth functions of speed and angle are evaluated at the middle of each fine step.  The module does
+not import the tested package.
 """
 
 from __future__ import annotations
@@ -114,7 +115,7 @@ def _move(i, w, h, v, torque, r, k, p, is_open):
 
 @njit(cache=True)
 def _piece(i, w, angle, h, v, coast, t, end, noise, p):  # noqa: C901 - every event in one loop
-    """Advance over h with events; ``coast``: the bridge is off, diodes carry what is left."""
+    """Advance over h with events; ``coast``: the bridge is off, diodes carry the current."""
     left = h
     for _ in range(50):
         if left <= 1e-15:
@@ -194,7 +195,7 @@ def _piece(i, w, angle, h, v, coast, t, end, noise, p):  # noqa: C901 - every ev
 
 @njit(cache=True)
 def _two_mass(i, w, angle, w2, angle2, h, v, t, end, noise, p):
-    """Advance motor and load that hang together by a spring with a gap, in small steps."""
+    """Advance motor and load coupled by a spring with a gap, in small steps."""
     n = max(1, int(math.ceil(h * math.sqrt(p[SPRING] / (p[J] * p[SHARE] * (1 - p[SHARE]))) * 12)))
     d = h / n
     slow = 1e-3 * p[SUPPLY] / p[K]

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """From an effect, a strength and a seed to arrays as somebody would have recorded them."""
 
 from __future__ import annotations
@@ -59,7 +60,7 @@ def measure(c: Case, rng: np.random.Generator) -> dict[str, object]:
     noise = floor_torque(c, n * every, fine, rng)
     out = world_motor.simulate(every, fine, change, u, target, noise, p)
     made = _sensed(c, out, every, fine, rng)
-    # What the tools write down: the command that ran up to the instant of each row.
+    # The tools record the command that acted up to the instant of each row.
     voltage = np.concatenate([[0.0], u])[: n + 1]
     if c.stamps.get("first_row"):
         voltage[0] = u[0]
@@ -70,7 +71,7 @@ def fine_steps(c: Case) -> int:
     """Return how many steps of the simulation make a sample."""
     m = c.motor
     every = int(np.clip(np.ceil(60 * c.step / min(c.tau, 1.0)), 4, 24))
-    if c.sensor.get("i_lowpass") or c.sensor.get("i_window"):  # what it follows is the winding
+    if c.sensor.get("i_lowpass") or c.sensor.get("i_window"):  # it follows the winding
         every = int(np.clip(np.ceil(8 * c.step * m.R / m.L), every, 96))
     return every
 
@@ -106,7 +107,7 @@ def filtered(x: np.ndarray, a: float) -> np.ndarray:
 
 
 def low_passed(x: np.ndarray, step: float, lag: float) -> np.ndarray:
-    """Return the first-order low-pass of what runs straight between its samples, from rest."""
+    """Return the first-order low-pass of a linearly interpolated signal, from rest."""
     from scipy.signal import lfilter
 
     kept = np.exp(-step / lag)
@@ -123,7 +124,7 @@ def _window(integral: np.ndarray, fine: float, span: float, at: np.ndarray) -> n
 def _sensed(
     c: Case, out: np.ndarray, every: int, fine: float, rng: np.random.Generator
 ) -> dict[str, object]:
-    """Return what the sensors make of the motion."""
+    """Return the sensors' readings of the motion."""
     at = np.arange(0, len(out), every) * fine
     sign = c.sensor.get("sign", 1.0)
     if c.signals == "speed":

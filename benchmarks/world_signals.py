@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Random motors and the voltages that people drive them with."""
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ class Motor:
     gear: float
 
     def truth(self) -> dict[str, float]:
-        """Return what an identification of the plain motor should say."""
+        """Return the correct identification of the plain motor."""
         a0 = self.K + self.R * self.b / self.K
         return {
             "dc_gain": 1 / a0,

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The documentation as a site: ``make docs`` writes docs/_build/html (Sphinx, MyST, numpydoc)."""
 
 project = "smp_motor_control"
