@@ -122,6 +122,7 @@ def check_wheels(
         {w: known[w].parameters.dc_gain for w in wheels if w in known},
         {w: known[w].gearbox.ratio for w in wheels if w in known},
         wheel_test.read_battery(client),
+        {wheel: tape.position_problem() for wheel, tape in test.tapes.items()},
     )
     levels = [one.level for one in found.values() if math.isfinite(one.level)]
     amplitude = max(levels, default=limit)

@@ -38,6 +38,8 @@ class Robot:
     gains: Mapping[str, float] = field(default_factory=dict)
     ratios: Mapping[str, float] = field(default_factory=dict)  # known gear ratios
     battery: float = math.nan  # voltage that the battery reports [V]; NaN where it does not
+    # by wheel the fault of the position that its driver reports, and its remedy
+    positions: Mapping[str, str] = field(default_factory=dict)
 
 
 Check = Callable[[Robot], Iterator[Finding]]
@@ -69,6 +71,13 @@ def feedback(robot: Robot) -> Iterator[Finding]:
                 {"wheel": wheel, "stamps": one.repeated},
                 "stamp every sample with the instant at which it was taken",
             )  # fmt: skip
+
+
+def position(robot: Robot) -> Iterator[Finding]:
+    """Check that odometry can use the positions."""
+    for wheel, problem in robot.positions.items():
+        if problem:
+            yield Finding("position", "warning", f"{wheel}: {problem}", {"wheel": wheel})
 
 
 def motion(robot: Robot) -> Iterator[Finding]:
@@ -281,7 +290,9 @@ def _compare_with_others(
             yield Finding(*code, text, evidence, advice)
 
 
-CHECKS: tuple[Check, ...] = (feedback, motion, signs, gear_ratio, dead_zone, supply, compare_wheels)
+CHECKS: tuple[Check, ...] = (
+    feedback, position, motion, signs, gear_ratio, dead_zone, supply, compare_wheels,
+)  # fmt: skip
 """All checks, the most basic first."""
 
 

@@ -239,3 +239,10 @@ def test_samples_that_come_in_bunches_settle_nothing() -> None:
 def _rows(part: Trace) -> np.ndarray:
     names = ("time", "age", "command", "voltage", "velocity", "position", "count", "phase")
     return np.stack([getattr(part, name) for name in names], axis=1)
+
+
+def test_a_position_without_use_for_odometry_is_a_warning_of_its_wheel() -> None:
+    found = judge(Robot({}, {}, positions={"left": "its position wraps", "right": ""}))
+    assert [(f.code, f.severity, f.message) for f in found] == [
+        ("position", "warning", "left: its position wraps")
+    ]
