@@ -43,7 +43,7 @@ SWITCHES: dict[str, list[Patch]] = {
     "exchanges": policy(doubtful=float("inf")),
     "second and third candidate": policy(tried=1),
     "extra price": policy(extra=0.0),
-    "lag re-attributed": [(search, "_relabelled", lambda *_: ())],
+    "lag re-attributed": [(search, "relabelled", lambda *_: ())],
     "size along the signature": [(search, "_scaled", lambda *_: None)],
     "dropping": [(search, "_without_needless", lambda found, *_: found)],
     "second and third guess": [(search, "guesses", lambda data, _, one=None: guess(data, 1, one))],

@@ -99,8 +99,8 @@ def _estimated(group: list[Record], request: Request, found: Sequence[Finding]) 
     data = prepare(group, request.use_current, LOSSES[request.loss])
     best = _best_fit(data, request)
     levels = levels_of(data)
-    parts = contributions(data, best, levels)
     hardware = group[0].hardware
+    parts = contributions(data, best, levels, hardware.timing_accuracy)
     result = answer(data, best, parts, levels, hardware, request.known)
     request.say("validating")
     judged = Judged(

@@ -70,8 +70,8 @@ class MeanSpeed(Sensor):
         return _mean_speed(rows.time, rows.segment, motion.speed, motion.angle, p["window"])
 
     def starts(self, scales: Scales) -> Sequence[Mapping[str, float]]:
-        """Return windows of one to sixteen rows."""
-        return [{"window": n * scales.step} for n in (1.0, 2.0, 5.0, 16.0)]
+        """Return windows of one to forty rows."""
+        return [{"window": n * scales.step} for n in (1.0, 2.0, 5.0, 16.0, 40.0)]
 
 
 class DifferencedSpeed(MeanSpeed):

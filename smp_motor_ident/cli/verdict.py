@@ -89,16 +89,21 @@ def show(
 def check_estimates(
     truth: Mapping[str, MotorEntry], estimates: Mapping[str, Estimate]
 ) -> list[Check]:
-    """Check the identified motors against the limits."""
+    """Check the identified motors against the limits.
+
+    A deviation is random, with that of the instants at which a running loop reads.
+    """
     gain, deviation = [], []
     beyond = set()
     for wheel in estimates:
+        timing = next((s.moves for s in estimates[wheel].systematic if s.cause == "timing"), {})
         for name, true, quantity in _compared(truth[wheel], estimates[wheel]):
             error = abs((quantity.value or math.nan) - true)
             if name == "dc_gain":
                 gain.append((100.0 * error / true, wheel))
             if quantity.status == "estimated":
-                deviations = error / (quantity.std or 1e-300)
+                std = math.hypot(quantity.std or 1e-300, timing.get(name, 0.0))
+                deviations = error / std
                 deviation.append((deviations, f"{wheel} {name}"))
                 if not deviations <= MAX_DEVIATIONS:
                     beyond.add(wheel)

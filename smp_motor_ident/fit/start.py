@@ -25,7 +25,7 @@ LAGS = 28
 FRICTIONS = (0.0, 0.04, 0.12, 0.3)  # of the largest command
 DELAYS = (0.0, 1.0, 3.0)  # rows
 LONG_DELAYS = (10.0, 20.0, 40.0, 80.0, 160.0, 320.0)  # rows
-POOR = 0.3  # share of the output's energy that a start leaves, from which long delays are tried
+POOR = 0.1  # share of the output's energy that a start leaves, from which long delays are tried
 ROWS = 3000
 
 

@@ -13,6 +13,12 @@ CURRENT_ACCURACY = Limit(
     "supply of 5 V that is known to as much: 5 % either way, uniformly",
     "test_limits_hold.py: scale error of a current is within the systematic uncertainty",
 )
+TIMING_ACCURACY = Limit(
+    0.02,
+    "rows between stamp and reading, a standard deviation",
+    "physical: a loop computes for some hundredths of its period before it commands",
+    "test_limits_hold.py: instant of a reading is within the systematic uncertainty",
+)
 ONE_SIZE_ACCURACY = Limit(
     0.1,
     "of gain and lag, a standard deviation",

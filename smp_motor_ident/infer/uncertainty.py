@@ -18,7 +18,7 @@ import numpy as np
 from smp_motor_control.arrays import Array
 from smp_motor_ident.chain.chain import Chain
 from smp_motor_ident.chain.component import Component
-from smp_motor_ident.chain.motor import Friction
+from smp_motor_ident.chain.motor import Delay, Friction
 from smp_motor_ident.chain.quantities import REPORTED
 from smp_motor_ident.fit.adequacy import scatters
 from smp_motor_ident.fit.data import SEARCH_ROWS, Data
@@ -31,6 +31,7 @@ from smp_motor_ident.fit.search import (
     residual_of,
     typical_size,
 )
+from smp_motor_ident.infer.instrument_limits import TIMING_ACCURACY
 from smp_motor_ident.infer.levels import Levels
 
 SUPPORTED = 0.1  # probability from which a component is part of the random uncertainty
@@ -47,8 +48,13 @@ class Contribution:
     adds: Mapping[str, float] = field(default_factory=dict)  # to quantities that the chain lacks
 
 
-def contributions(data: Data, found: Fit, levels: Levels) -> list[Contribution]:
-    """Return all parts of the random uncertainty; their sum does not depend on their order."""
+def contributions(
+    data: Data, found: Fit, levels: Levels, timing: float | None = None
+) -> list[Contribution]:
+    """Return all parts of the uncertainty; their sum does not depend on their order.
+
+    ``timing``: accuracy of the instants of the readings [s].
+    """
     parts = [*of_noise(found), *of_priors(found)]
     if levels.steady and "vc" in found.names:
         parts.append(of_one_level(found))
@@ -60,6 +66,8 @@ def contributions(data: Data, found: Fit, levels: Levels) -> list[Contribution]:
     share = seen.linear.row.size / found.linear.row.size
     parts += considered(some, seen, 1 / share)
     parts += of_relabelled(some, seen)
+    seconds = TIMING_ACCURACY.value * data.sample if timing is None else timing
+    parts += of_timing(some, seen, seconds)
     return parts
 
 
@@ -93,6 +101,23 @@ def of_one_level(found: Fit) -> Contribution:
     (_, _, deviation) = Friction().expected(found.scales)[0]
     shift = found.covariance[:, k] / found.covariance[k, k]
     return Contribution("vc", np.zeros_like(found.covariance), shift * deviation)
+
+
+def of_timing(data: Data, found: Fit, seconds: float) -> list[Contribution]:
+    """Return what changes if the readings were taken so much later than their stamps say.
+
+    A delay that is part of the chain takes that up.
+    """
+    if found.chain.has("delay"):
+        return []
+    late = 0.1 * data.sample
+    r = residual_of(data, found.chain.with_component(Delay(), {"delay": late}), found)
+    if r is None:
+        return []
+    m = found.linear.row.size
+    signature = r - found.linear.residual[:m]
+    shift = found.covariance @ (found.linear.columns[:m].T @ signature)
+    return [Contribution("timing", np.zeros_like(found.covariance), -shift * seconds / late)]
 
 
 def of_relabelled(data: Data, found: Fit) -> Iterator[Contribution]:

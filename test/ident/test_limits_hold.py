@@ -63,3 +63,15 @@ def test_a_motor_that_friction_nearly_holds_is_unreliable() -> None:
     assert next(f for f in held.findings if f.code == "friction_dominates").severity == "unreliable"
     turns = estimate(motors.record("rear_left", static_voltage=4.5, seconds=4.0))
     assert "friction_dominates" not in [f.code for f in turns.findings]
+
+
+def test_instant_of_a_reading_is_within_the_systematic_uncertainty() -> None:
+    """A reading that is late by some of a row looks like as much less lag."""
+    made = replace(motors.record("rear_left", current=False), velocity=None)
+    known = replace(made, hardware=replace(made.hardware, timing_accuracy=0.0))
+    moves = [
+        {s.cause: s.moves["time_constant"] for s in estimate(one).systematic}.get("timing", 0.0)
+        for one in (made, known)
+    ]
+    assert abs(moves[0]) == pytest.approx(0.02 * made.sample_time, rel=0.5)
+    assert moves[1] == 0.0

@@ -38,9 +38,11 @@ def test_a_step_and_its_mirror_image_tell_the_same_motor(volts):
     for name in ("time_constant", "averaging_window"):
         # The same sums in other signs: nothing but rounding may differ.
         assert one.value(name) == pytest.approx(other.value(name), rel=1e-6)
-    # A remaining lag takes up to 3 ms from the window.
-    assert one.value("averaging_window") == pytest.approx(WINDOW * STEP, abs=0.004)
-    assert one.value("time_constant") == pytest.approx(TAU, abs=0.003)
+    # A remaining lag takes up to 3 ms from the window; under one step a driver's ramp looks alike.
+    ramp = one.chain.values.get("ramp_time", 0.0)
+    assert one.value("averaging_window") + ramp == pytest.approx(WINDOW * STEP, abs=0.004)
+    lag = one.combinations["time_constant"]
+    assert abs(lag.value - TAU) < 2 * lag.total_std
 
 
 @pytest.mark.parametrize("sign", [1, -1])
