@@ -86,8 +86,8 @@ class Data:
         return speed
 
     def thinned(self, most: int) -> Data:
-        """Return every so many rows, at most about ``most`` in all; the command stays whole."""
-        every = -(-len(self) // most)
+        """Return every so many rows, less than twice ``most`` in all; the command stays whole."""
+        every = len(self) // most
         if every <= 1:
             return self
         rows = self.rows

@@ -414,7 +414,7 @@ def _is_negligible(data: Data, found: Fit, one: Component, plainer: Chain) -> bo
     off = abs(found.chain.values[first.name] - first.neutral * unit)
     if off < 0.01 * first.typical * unit and one.slot != "current sensor":
         return True
-    if off > 3 * math.sqrt(found.covariance[k, k]):
+    if one.severity == "note" or off > 3 * math.sqrt(found.covariance[k, k]):
         return False
     bare = quick(data, plainer, found)  # a size that no derivative tells may be needed all the same
     return gain_of(data, bare.linear, found.linear.residual) < 9.0

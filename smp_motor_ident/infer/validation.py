@@ -11,9 +11,12 @@ import numpy as np
 from smp_motor_control.arrays import Array, Integers
 from smp_motor_ident.chain.catalogue import chain_from
 from smp_motor_ident.chain.chain import Chain
+from smp_motor_ident.chain.component import Scales
+from smp_motor_ident.chain.motor import Load
 from smp_motor_ident.chain.sensor import Angle, Speed
 from smp_motor_ident.fit.data import Data, prepare
 from smp_motor_ident.fit.descend import Fit, descend, settle
+from smp_motor_ident.fit.noise import Noise
 from smp_motor_ident.fit.start import filled
 from smp_motor_ident.record import Record
 from smp_motor_ident.result import Estimate, FitPercent
@@ -116,7 +119,19 @@ def _held_out(
     judged = prepare(kept, False)
     if judged.is_angle != data.is_angle or not any(np.ptp(r.voltage) for r in kept):
         return float("nan")
-    return speed_fit(judged, settle(judged, chain, found.scales))
+    return speed_fit(judged, _under_its_load(judged, chain, found.scales))
+
+
+def _under_its_load(data: Data, chain: Chain, scales: Scales) -> Array:
+    """Return the motion simulated freely, its initial states and its constant load fitted."""
+    chain = chain.without_slot("current sensor")
+    if not chain.has("load"):
+        chain = chain.with_component(Load(), {"load": 0.0})
+    others = frozenset(p.name for p in chain.parameters) - {"load"}
+    motion = replace(data, current=None)
+    noise = [Noise.white(1e-3 * float(np.nanstd(data.motion)) or 1.0)]
+    chain = replace(chain, fixed=others, constraints=())
+    return descend(motion, chain, scales, data.initial, noise, most=12).motion
 
 
 def _fit_of_end(group: Sequence[Record], data: Data, found: Fit) -> float:

@@ -84,7 +84,9 @@ def test_a_motor_that_its_load_would_drive_one_way_is_unreliable():
     noise = 0.5 * np.random.default_rng(5).standard_normal(t.size)
     found = estimate(Record("motor", t, level, velocity=15.0 * 4.0 + 8.0 * changes + noise))
     # A driver that lets the motor coast, or that clips, does the same.
-    assert {"driving_load", "coast", "clip"} & {f.code for f in found.findings if f.severity != "note"}
+    assert {"driving_load", "coast", "clip"} & {
+        f.code for f in found.findings if f.severity != "note"
+    }
 
 
 def test_an_impossible_motor_is_reported():

@@ -41,7 +41,10 @@ def test_prbs_of_one_day_explains_the_other_day(fitted, kept):
 def test_five_days_scatter_no_more_than_the_intervals_of_each():
     found = [estimate(prbs(f"2026-08-{day}")).combinations for day in (11, 14, 15, 17, 18)]
     for name in ("dc_gain", "time_constant", "static_voltage"):
-        value, std = (np.array([getattr(f[name], a) for f in found]) for a in ("value", "std"))
+        # The load differs from day to day, which no recording of one shows.
+        value, std = (
+            np.array([getattr(f[name], a) for f in found]) for a in ("value", "total_std")
+        )
         mean = np.average(value, weights=std**-2)
         assert np.sum(np.square((value - mean) / std)) / 4 < 1.5**2, name
 
@@ -58,7 +61,8 @@ def test_five_steps_in_one_fit_tell_the_speed_filter_from_a_delay():
 
 def test_ten_steps_in_one_fit_tell_the_friction_that_their_steady_speeds_do():
     result = estimate([step(p) for p in sorted((DATA / "step_gearmotor").glob("*.csv"))])
-    assert 0.025 < result.value("time_constant") < 0.028
+    lag = result.combinations["time_constant"]
+    assert abs(lag.value - 0.0265) < 2 * lag.total_std
     # Lines through the five steady speeds of each way: 13.9 and 14.5 rad/s/V, 1.07 and 1.15 V.
     for name, known in (("dc_gain", 14.2), ("static_voltage", 1.11)):
         q = result.combinations[name]
