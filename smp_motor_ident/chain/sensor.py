@@ -203,7 +203,7 @@ class SupplyCurrent(MeanCurrent):
 @compiled
 def _mean_speed(time: Array, segment: Integers, speed: Array, angle: Array, window: Array) -> Array:
     """Return the mean speed over a trailing window; the angle between rows is a cubic."""
-    out = np.empty(speed.shape)
+    out = np.empty((speed.shape[1], speed.shape[0]))
     for g in range(segment.shape[0] - 1):
         first, last = segment[g], segment[g + 1]
         for b in range(speed.shape[1]):
@@ -214,10 +214,10 @@ def _mean_speed(time: Array, segment: Integers, speed: Array, angle: Array, wind
                 while j + 1 < k and time[j + 1] <= begin:
                     j += 1
                 if span <= 0.0:
-                    out[k, b] = speed[k, b]
+                    out[b, k] = speed[k, b]
                 elif begin <= time[first]:  # before the record it ran as at its beginning
                     early = angle[first, b] + speed[first, b] * (begin - time[first])
-                    out[k, b] = (angle[k, b] - early) / span
+                    out[b, k] = (angle[k, b] - early) / span
                 else:
                     h = time[j + 1] - time[j]
                     x = (begin - time[j]) / h
@@ -225,23 +225,23 @@ def _mean_speed(time: Array, segment: Integers, speed: Array, angle: Array, wind
                     s0, s1 = speed[j, b] * h, speed[j + 1, b] * h
                     y = x * x * (3 - 2 * x)
                     early = a + (c - a) * y + x * (1 - x) * ((1 - x) * s0 - x * s1)
-                    out[k, b] = (angle[k, b] - early) / span
-    return out
+                    out[b, k] = (angle[k, b] - early) / span
+    return out.T
 
 
 @compiled
 def _low_pass(time: Array, segment: Integers, speed: Array, angle: Array, lag: Array) -> Array:
     """Return the speed low-passed; between rows it is the parabola of its ends and its mean."""
-    out = np.empty(speed.shape)
+    out = np.empty((speed.shape[1], speed.shape[0]))
     for g in range(segment.shape[0] - 1):
         first, last = segment[g], segment[g + 1]
         for b in range(speed.shape[1]):
             tau = lag[b]
             s = speed[first, b]
-            out[first, b] = s
+            out[b, first] = s
             for k in range(first + 1, last):
                 if tau <= 0.0:
-                    out[k, b] = speed[k, b]
+                    out[b, k] = speed[k, b]
                     continue
                 h = time[k] - time[k - 1]
                 w0, w1 = speed[k - 1, b], speed[k, b]
@@ -258,18 +258,18 @@ def _low_pass(time: Array, segment: Integers, speed: Array, angle: Array, lag: A
                 else:
                     i0, i1, i2 = r - 0.5 * r * r, 0.5 * r - r * r / 6, r / 3 - r * r / 12
                 s = e * s + w0 * i0 + c1 * i1 + c2 * i2
-                out[k, b] = s
-    return out
+                out[b, k] = s
+    return out.T
 
 
 @compiled
 def _smooth(segment: Integers, values: Array, late: Array) -> Array:
-    out = np.empty(values.shape)
+    out = np.empty((values.shape[1], values.shape[0]))
     for g in range(segment.shape[0] - 1):
         for b in range(values.shape[1]):
             share = 1.0 / (1.0 + late[b])
             y = values[segment[g], b]
             for k in range(segment[g], segment[g + 1]):
                 y += share * (values[k, b] - y)
-                out[k, b] = y
-    return out
+                out[b, k] = y
+    return out.T

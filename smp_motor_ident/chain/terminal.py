@@ -25,17 +25,17 @@ class Driver:
     numbers : ndarray, shape (7,)
         Dead zone [V], clip [V], rate [V/s], weakness in reverse, command of full duty [V], the
         share of a0 that is back-EMF, and the least effective command [V].
-    lanes : ndarray, shape (parameters, 1)
+    lane : ndarray, shape (parameters,)
         As in `simulate.lanes`.
     """
 
     numbers: Array
-    lanes: Array
+    lane: Array
 
     @property
     def threshold(self) -> float:
         """Command [V] that it swallows before anything moves."""
-        return float(self.numbers[DEAD_ZONE] + self.lanes[at.DROP, 0])
+        return float(self.numbers[DEAD_ZONE] + self.lane[at.DROP])
 
     @property
     def limit(self) -> float:
@@ -50,14 +50,14 @@ class Driver:
     @property
     def drive(self) -> float:
         """Largest voltage [V] beyond the back-EMF, to which it limits the current."""
-        return float(self.lanes[at.CURRENT_LIMIT, 0])
+        return float(self.lane[at.CURRENT_LIMIT])
 
 
 def driver_of(chain: Chain, largest: float, supply: float) -> Driver:
     """Return the driver of a chain that was identified with commands up to ``largest`` [V]."""
     values = chain.values
-    lanes = chain.lanes({n: np.array([v]) for n, v in values.items()}, 1)
-    lanes[[at.DECLINE, at.FRICTION_DRIFT, at.LOAD_STEP]] = 0.0
+    lane = chain.lanes({n: np.array([v]) for n, v in values.items()}, 1)[:, 0].copy()
+    lane[[at.DECLINE, at.FRICTION_DRIFT, at.LOAD_STEP]] = 0.0
     ramp = values.get("ramp_time", 0.0)
     numbers = np.array([
         values.get("dead_zone", 0.0),
@@ -68,17 +68,17 @@ def driver_of(chain: Chain, largest: float, supply: float) -> Driver:
         1.0 - values.get("viscous", 0.0),
         values.get("least_command", 0.0),
     ])  # fmt: skip
-    return Driver(numbers, lanes)
+    return Driver(numbers, lane)
 
 
 def no_driver() -> Driver:
     """Return a driver that puts out its command."""
-    return Driver(np.array([0.0, np.inf, np.inf, 0.0, 1.0, 1.0, 0.0]), at.NEUTRAL[:, None].copy())
+    return Driver(np.array([0.0, np.inf, np.inf, 0.0, 1.0, 1.0, 0.0]), at.NEUTRAL.copy())
 
 
 @compiled
 def put_out(
-    numbers: Array, lanes: Array, command: float, back_emf: float, before: float, interval: float
+    numbers: Array, lane: Array, command: float, back_emf: float, before: float, interval: float
 ) -> tuple[float, float]:
     """Return the mean voltage at the terminals over an interval, and the command at its end [V].
 
@@ -98,4 +98,4 @@ def put_out(
         share = min(abs(u - before) / most, 1.0) if most > 0.0 else 1.0
         u = end - 0.5 * (end - before) * share
     emf = numbers[EMF_SHARE] * back_emf
-    return terminal_voltage(0, u, emf, 0.0, numbers[FULL_DUTY], lanes), end
+    return terminal_voltage(u, emf, 0.0, numbers[FULL_DUTY], lane), end

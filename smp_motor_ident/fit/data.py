@@ -60,6 +60,26 @@ class Data:
         return tuple(np.flatnonzero(np.isfinite(y)) for y in self.outputs)
 
     @cached_property
+    def row(self) -> Integers:
+        """Row of every measured value, one output after the other."""
+        return np.concatenate(self.known)
+
+    @cached_property
+    def output(self) -> Integers:
+        """Place of the output of every measured value."""
+        return np.repeat(np.arange(len(self.known)), [k.size for k in self.known])
+
+    @cached_property
+    def bounds(self) -> Integers:
+        """First and end of every segment among the measured values, shape (segments, outputs, 2)."""
+        ends, offset = [], 0
+        for known in self.known:
+            ends.append(offset + np.searchsorted(known, self.rows.segment))
+            offset += known.size
+        at = np.array(ends)
+        return np.stack([at[:, :-1].T, at[:, 1:].T], axis=2)
+
+    @cached_property
     def runs(self) -> tuple[Integers, ...]:
         """Runs of measured rows without a gap: first and end, as places in `known`."""
         return tuple(runs_of(rows, self.rows.segment, 1) for rows in self.known)

@@ -9,7 +9,7 @@ Derivation: docs/derivations.md, sections 5 and 6.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -24,7 +24,8 @@ from smp_motor_ident.fit.noise import MAX_ORDER, Noise, fit_noise
 
 FARTHEST = 1.5  # e-folds that a logarithm moves in one step
 MAX_STEPS = 30
-CONVERGED = 1e-3  # of the deviance: a tenth of a standard deviation squared is 1e-2
+CONVERGED = 1e-2  # of the deviance: a tenth of a standard deviation
+MOST_DAMPING = 100.0
 PRIOR_STATE = 2.0  # of q and speed at the beginning of a segment, in the largest of the recording
 
 
@@ -43,6 +44,8 @@ class Linear:
     local_step: Array  # shape (segments, 3): of the initial states at a step of zero
     local_gain: Array  # shape (segments, 3, p): its decrease per parameter step
     simulated: tuple[Array, ...]  # every output, shape (n,)
+    local: Array  # shape (3, m): derivatives by the initial states
+    inverse: Array  # shape (segments, 3, 3): of their normal matrix, with their prior
 
     @cached_property
     def cost(self) -> float:
@@ -101,9 +104,11 @@ def linearise(
     """Return whitened residuals and derivatives of a chain."""
     free = chain.free
     p = len(free)
-    count = p + 3  # the base, a lane for each parameter, then for q and w of the segments
+    # The base, a lane for each parameter, then for q and w of the segments unless all begin at rest.
+    states = 0 if data.stood.all() else 2
+    count = p + 1 + states
     values = {q.name: np.full(count, chain.values[q.name]) for q in chain.parameters}
-    difference = np.empty(count - 1)
+    difference = np.empty(p + 2)
     for j, parameter in enumerate(free):
         d = parameter.difference(scales)
         if chain.values[parameter.name] + d > parameter.bounds(scales)[1]:
@@ -113,25 +118,82 @@ def linearise(
         difference[j] = d
         values[parameter.name][j + 1] += d
     own = np.zeros((4, count))
-    own[0, p + 1] = difference[p] = 1e-6 * scales.volts
-    own[1, p + 2] = difference[p + 1] = 1e-6 * scales.speed
-    got = respond(chain, values, data.rows, scales, initial, own)
-    outputs = (got.motion,) if got.current is None else (got.motion, got.current)
-    n = len(data)
-    parts: list[Array] = []
-    simulated: list[Array] = []
+    difference[p:] = 1e-6 * scales.volts, 1e-6 * scales.speed
+    for j in range(states):
+        own[j, p + 1 + j] = difference[p + j]
+    outputs = _outputs(chain, values, data, scales, initial, own)
+    parts = []
     for k, (measured, predicted) in enumerate(zip(data.outputs, outputs, strict=True)):
         known = data.known[k]
-        simulated.append(predicted[:, 0].copy())
-        columns = np.empty((known.size, p + 4))
-        shown = predicted if known.size == n else predicted[known]
-        columns[:, 0] = measured[known] - shown[:, 0]
-        np.subtract(shown[:, 1:], shown[:, :1], out=columns[:, 1 : p + 3])
-        columns[:, 1 : p + 3] /= difference
-        columns[:, p + 3] = 1.0 if data.is_angle and k == 0 else 0.0
-        runs = data.whole_runs if noise[k].over_gaps else data.runs
-        parts.append(noise[k].whiten(columns, runs[k]))
-    return _eliminate(data, parts, p, scales, initial, tuple(simulated), _prior(chain, scales)[:2])
+        lines = np.zeros((p + 4, known.size))
+        lines[0] = measured[known] - predicted[0, known]
+        np.subtract(predicted[1:, known], predicted[0, known], out=lines[1:count])
+        lines[1:count] /= difference[: count - 1, None]
+        lines[p + 3] = 1.0 if data.is_angle and k == 0 else 0.0
+        parts.append(noise[k].whiten(lines, _runs(data, k, noise[k])))
+    residuals, rows, _ = _prior(chain, scales)
+    priors = np.zeros((p + 4, residuals.size))
+    priors[0], priors[1 : p + 1] = residuals, rows.T
+    simulated = tuple(predicted[0].copy() for predicted in outputs)
+    return _eliminate(data, parts, priors, scales, initial, simulated)
+
+
+def _outputs(
+    chain: Chain, values: Mapping[str, Array], data: Data, scales: Scales, initial: Array,
+    own: Array | None = None,
+) -> list[Array]:  # fmt: skip
+    """Return every output of a chain, shape (lanes, n)."""
+    got = respond(chain, values, data.rows, scales, initial, own)
+    return [got.motion.T] if got.current is None else [got.motion.T, got.current.T]
+
+
+def _runs(data: Data, k: int, noise: Noise) -> Integers:
+    return data.whole_runs[k] if noise.over_gaps else data.runs[k]
+
+
+def residual(data: Data, chain: Chain, like: Fit) -> Array | None:
+    """Return the whitened residual of a chain under the noise of a fit, None if not finite.
+
+    Initial states are fitted by the derivatives of that fit.  Shape (m,).
+    """
+    values = {p.name: np.array([chain.values[p.name]]) for p in chain.parameters}
+    outputs = _outputs(chain, values, data, like.scales, like.initial)
+    parts = []
+    for k, (measured, predicted) in enumerate(zip(data.outputs, outputs, strict=True)):
+        known = data.known[k]
+        rest = (measured[known] - predicted[0, known])[None]
+        parts.append(like.noise[k].whiten(rest, _runs(data, k, like.noise[k]))[0])
+    r = np.concatenate(parts)
+    if not np.isfinite(r).all():
+        return None
+    if np.isfinite(data.huber):
+        r *= _weight(r, data.huber)
+    linear = like.linear
+    pull = _pull(like.scales, like.initial)
+    for k, ends in enumerate(data.bounds):
+        right = -pull[k]
+        for first, last in ends:
+            right = right + linear.local[:, first:last] @ r[first:last]
+        solved = linear.inverse[k] @ right
+        for first, last in ends:
+            r[first:last] -= solved @ linear.local[:, first:last]
+    return r
+
+
+def _weight(residual: Array, huber: float) -> Array:
+    """Return the square root of the weights of a robust loss."""
+    return np.sqrt(np.minimum(1.0, huber / np.maximum(np.abs(residual), 1e-300)))
+
+
+def _state_prior(scales: Scales) -> Array:
+    """Return the weights of the priors of q, speed and angle at the beginning of a segment."""
+    sizes = PRIOR_STATE * np.array([scales.volts, scales.speed, np.inf])
+    return np.asarray(sizes**-2.0)
+
+
+def _pull(scales: Scales, initial: Array) -> Array:
+    """Return the gradient of the priors of the initial states, shape (segments, 3)."""
+    return np.asarray(_state_prior(scales) * initial[:, :3])
 
 
 def _prior(chain: Chain, scales: Scales) -> tuple[Array, Array, tuple[str, ...]]:
@@ -175,44 +237,35 @@ def _constrained(chain: Chain, constraint: Constraint) -> tuple[Array, float, fl
 
 
 def _eliminate(
-    data: Data, parts: Sequence[Array], p: int, scales: Scales, initial: Array,
-    simulated: tuple[Array, ...], prior_rows: tuple[Array, Array],
+    data: Data, parts: Sequence[Array], priors: Array, scales: Scales, initial: Array,
+    simulated: tuple[Array, ...],
 ) -> Linear:  # fmt: skip
     """Project the initial states of all segments out of residual and columns."""
-    segment = data.rows.segment
-    g = segment.size - 1
-    step, gain = np.zeros((g, 3)), np.zeros((g, 3, p))
-    prior = [(PRIOR_STATE * size) ** -2 for size in (scales.volts, scales.speed)]
-    kept = []
-    bounds = [np.searchsorted(known, segment) for known in data.known]
-    rows, output = [], []
-    for k in range(g):
-        slices = [slice(b[k], b[k + 1]) for b in bounds]
-        block = np.concatenate([part[own] for part, own in zip(parts, slices, strict=True)])
-        rows += [known[own] for known, own in zip(data.known, slices, strict=True)]
-        output += [np.full(own.stop - own.start, n) for n, own in enumerate(slices)]
-        if np.isfinite(data.huber):
-            size = np.maximum(np.abs(block[:, 0]), 1e-300)
-            block = block * np.sqrt(np.minimum(1.0, data.huber / size))[:, None]
-        local = [2] if data.stood[k] else [0, 1, 2]
-        columns = block[:, [p + 1 + j for j in local]]
-        rest = block[:, : p + 1]
-        small = columns.T @ columns
-        right = columns.T @ rest
-        for j in range(len(local) - 1):
-            small[j, j] += prior[j]
-            right[j, 0] -= prior[j] * initial[k, j]
-        scale = np.sqrt(np.maximum(np.diag(small), 1e-300))
-        small = small / np.outer(scale, scale) + 1e-12 * np.eye(len(local))
-        solved = np.linalg.solve(small, right / scale[:, None]) / scale[:, None]
-        kept.append(rest - columns @ solved)
-        step[k, local] = solved[:, 0]
-        gain[k, local] = solved[:, 1:]
-    kept.append(np.column_stack(prior_rows))
-    whole = np.concatenate(kept)
+    whole = np.concatenate([*parts, priors], axis=1)
+    m, p = data.row.size, whole.shape[0] - 4
+    if np.isfinite(data.huber):
+        whole[:, :m] *= _weight(whole[0, :m], data.huber)
+    g = data.rows.segment.size - 1
+    solved, inverse = np.zeros((g, 3, p + 1)), np.zeros((g, 3, 3))
+    pull = _pull(scales, initial)
+    prior = np.diag(_state_prior(scales))
+    for k, ends in enumerate(data.bounds):
+        inner = np.zeros((3, p + 4))
+        for first, last in ends:
+            inner += whole[p + 1 :, first:last] @ whole[:, first:last].T
+        inner[:, 0] -= pull[k]
+        free = slice(2, 3) if data.stood[k] else slice(0, 3)
+        small = (inner[:, p + 1 :] + prior)[free, free]
+        size = np.diag(small)
+        scale = np.sqrt(np.where(size > 0, size, 1.0))
+        small = small / np.outer(scale, scale) + 1e-12 * np.eye(scale.size)
+        inverse[k, free, free] = np.linalg.inv(small) / np.outer(scale, scale)
+        solved[k] = inverse[k] @ inner[:, : p + 1]
+        for first, last in ends:
+            whole[: p + 1, first:last] -= solved[k].T @ whole[p + 1 :, first:last]
     return Linear(
-        whole[:, 0], whole[:, 1:], np.concatenate(rows), np.concatenate(output),
-        prior_rows[0].size, step, gain, simulated,
+        whole[0], whole[1 : p + 1].T, data.row, data.output, priors.shape[1], solved[:, :, 0],
+        solved[:, :, 1:], simulated, whole[p + 1 :, :m], inverse,
     )  # fmt: skip
 
 
@@ -235,7 +288,6 @@ def descend(
         values = _moved(at, scales, step)
         taken = np.array([values[p.name] - at.values[p.name] for p in at.free])
         expected = float(taken @ (2 * linear.columns.T @ linear.residual - linear.normal @ taken))
-        local = np.abs(linear.local_step).max() > 0
         trial = at.with_values(values)
         trial_start = _settled(start, linear, taken)
         following = linearise(data, trial, scales, trial_start, noise)
@@ -246,8 +298,8 @@ def descend(
             if expected < converged and gained < converged:
                 break
         else:
-            damping = max(damping * 10, 1e-3)
-            if damping > 1e6 or (expected < converged and not local):
+            damping = max(damping * 10, 1e-2)
+            if damping > MOST_DAMPING or expected < converged:
                 break
     return Fit(at, scales, start, tuple(noise), linear, _deviance(data, linear, noise))
 
@@ -304,7 +356,7 @@ def _settled(initial: Array, linear: Linear, step: Array) -> Array:
 
 def fit(
     data: Data, chain: Chain, scales: Scales, initial: Array, noise: Sequence[Noise] | None = None,
-    rounds: int = 6, most: int = MAX_ORDER,
+    rounds: int = 6, most: int = MAX_ORDER, converged: float = CONVERGED,
 ) -> Fit:  # fmt: skip
     """Return the chain and the noise of every output that explain data best from given values."""
     if noise is None:
@@ -316,11 +368,13 @@ def fit(
         chain, initial = found.chain, found.initial
         noise = noises(data, found.linear, most)
     found = descend(data, chain, scales, initial, noise, most=8, converged=1.0)
-    for _ in range(rounds):
-        before = found.deviance
+    for k in range(rounds):
         noise = noises(data, found.linear, most)
-        found = descend(data, found.chain, scales, found.initial, noise)
-        if abs(before - found.deviance) < 0.1:
+        other = descend(data, found.chain, scales, found.initial, noise, converged=converged)
+        gained = _information_criterion(data, found) - _information_criterion(data, other)
+        if gained > 0 or k == 0:
+            found = other
+        if gained < 0.1:
             break
     return found
 

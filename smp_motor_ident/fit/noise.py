@@ -52,9 +52,9 @@ class Noise:
         last = max(deviation, math.sqrt(LEAST))
         return cls(np.array([[0.0], [1.0]]), np.array([1e3 * last, last]), True)
 
-    def whiten(self, columns: Array, runs: Integers) -> Array:
-        """Return columns of shape (n, c) whitened."""
-        return _whiten(columns, runs, self.predictors, self.deviation)
+    def whiten(self, lines: Array, runs: Integers) -> Array:
+        """Return lines of shape (c, n) whitened."""
+        return _whiten(lines, runs, self.predictors, self.deviation)
 
     def log_determinant(self, runs: Integers) -> float:
         """Return the logarithm of the determinant of the noise's covariance over all runs."""
@@ -128,21 +128,25 @@ def _burg(residual: Array, runs: Integers, most: int) -> tuple[Array, Array]:
 
 
 @compiled
-def _whiten(columns: Array, runs: Integers, predictors: Array, deviation: Array) -> Array:
-    n, c = columns.shape
+def _whiten(lines: Array, runs: Integers, predictors: Array, deviation: Array) -> Array:
+    count, n = lines.shape
     most = predictors.shape[1]
-    out = np.zeros((n, c))
-    for r in range(runs.shape[0]):
-        first = runs[r, 0]
-        for k in range(first, runs[r, 1]):
-            m = min(k - first, most)
-            for j in range(c):
-                out[k, j] = columns[k, j]
-            for i in range(m):
-                a = predictors[m, i]
-                for j in range(c):
-                    out[k, j] -= a * columns[k - 1 - i, j]
-            scale = 1.0 / deviation[m]
-            for j in range(c):
-                out[k, j] *= scale
+    scale = 1.0 / deviation[most]
+    out = np.zeros((count, n))
+    for j in range(count):
+        for r in range(runs.shape[0]):
+            first, last = runs[r, 0], runs[r, 1]
+            begun = min(first + most, last)
+            for k in range(first, begun):
+                m = k - first
+                x = lines[j, k]
+                for i in range(m):
+                    x -= predictors[m, i] * lines[j, k - 1 - i]
+                out[j, k] = x / deviation[m]
+            for k in range(begun, last):
+                out[j, k] = scale * lines[j, k]
+            for i in range(most):
+                a = scale * predictors[most, i]
+                for k in range(begun, last):
+                    out[j, k] -= a * lines[j, k - 1 - i]
     return out

@@ -29,11 +29,19 @@ from smp_motor_ident.chain.sensor import Angle, DifferencedSpeed, Speed
 from smp_motor_ident.errors import CurrentError, InsufficientExcitationError
 from smp_motor_ident.fit.adequacy import scatters
 from smp_motor_ident.fit.data import Data
-from smp_motor_ident.fit.descend import Fit, Linear, descend, fit, linearise, noises
+from smp_motor_ident.fit.descend import Fit, Linear, descend, fit, noises, residual
 from smp_motor_ident.fit.start import guesses
 
 SEARCH_ORDER = 2
 """Order of the noise model during the search; a higher one would absorb missing components."""
+SAME = 1.0
+"""Difference in deviance of two fits that ended at one minimum."""
+RESOLVED = 1.1
+"""Residual over the rounding of an encoder up to which it is rounding."""
+ROUGH = 0.3
+"""Change of the deviance at which a fit of the search ends."""
+CERTAIN = 20.0
+"""Deviations from none at which a component is needed without a fit that says so."""
 NEEDED = ("friction", "asymmetric_friction")
 """Components that every motor has."""
 
@@ -88,7 +96,14 @@ def search(data: Data, policy: SelectionPolicy | None = None, say: Say = lambda 
 
 
 def inadequacy(data: Data, found: Fit) -> float:
-    """Return the disagreement between parts of the record relative to chance: 1 if adequate."""
+    """Return the disagreement between parts of the record relative to chance: 1 if adequate.
+
+    An angle that is explained to the resolution of its encoder asks for nothing more.
+    """
+    if data.is_angle:
+        left = float(np.nanstd(data.motion - found.motion))
+        if left < RESOLVED * data.quantum / math.sqrt(12):
+            return 1.0
     return max((one.ratio for one in scatters(data, found)), default=1.0)
 
 
@@ -118,8 +133,7 @@ def _restarts(found: Fit, data: Data, policy: SelectionPolicy, say: Say) -> list
         if not one.alters or found.chain.has(one.code):
             continue
         say(f"beginning again with {one.title}")
-        for chain in guesses(motion, 1, one):
-            fits += _begun(motion, chain, policy)
+        fits += _begun(motion, guesses(motion, 1, one), policy)
     fits.sort(key=lambda f: f.deviance)
     best = fits[:1]
     return best if data.current is None else [_with_current(data, f) for f in best]
@@ -147,7 +161,7 @@ def screen(found: Fit, data: Data, policy: SelectionPolicy) -> list[Candidate]:
     base = found.linear.residual[:m]
     best: dict[str, Candidate] = {}
     for one, chain in candidates(found, data):
-        r = residual_of(data, chain, found)
+        r = residual(data, chain, found)
         if r is None:
             continue
         # What the other parameters take up of it, as far as their priors let them.
@@ -166,14 +180,6 @@ def screen(found: Fit, data: Data, policy: SelectionPolicy) -> list[Candidate]:
         if one.code not in best or gain > best[one.code].gain:
             best[one.code] = Candidate(chain, one, gain, price)
     return sorted(best.values(), key=lambda c: c.price - c.gain)
-
-
-def residual_of(data: Data, chain: Chain, like: Fit) -> Array | None:
-    """Return the whitened residual of a chain at its values, None where it is not finite."""
-    bare = replace(chain, fixed=frozenset(p.name for p in chain.parameters))
-    linear = linearise(data, bare, like.scales, like.initial, like.noise)
-    r = linear.residual[: linear.row.size]
-    return r if np.isfinite(r).all() else None
 
 
 def _information(one: Component, chain: Chain, found: Fit, energy: float) -> float:
@@ -225,23 +231,27 @@ def gain_of(data: Data, before: Linear, after: Array) -> float:
 def _begin(data: Data, policy: SelectionPolicy) -> Fit:
     """Return the best fit of the plainest motors from the best guesses."""
     motion = replace(data, current=None)
-    fits = []
-    for chain in guesses(motion, 3):
-        fits += _begun(motion, chain, policy)
+    fits = _begun(motion, guesses(motion, 3), policy)
     if not fits:
         raise InsufficientExcitationError("no motor follows the voltage")
     best = min(fits, key=lambda f: f.deviance)
     return best if data.current is None else _with_current(data, best)
 
 
-def _begun(data: Data, chain: Chain, policy: SelectionPolicy) -> list[Fit]:
-    """Return fits of second-order motors that begin at a guess."""
-    scales = data.scales(math.exp(chain.values["ln_a1"] - chain.values["ln_a0"]))
-    chain = chain.with_values({"vc": max(chain.values["vc"], 0.01 * scales.volts)})
-    chain = chain.with_component(*plain_sensor(data))
-    chain = with_given(chain, data, policy.given)
-    first = fit(data, chain, scales, data.initial, rounds=2, most=SEARCH_ORDER)
-    return [first] if policy.first_order else [_second_order(data, first, s) for s in (0.01, 0.1)]
+def _begun(data: Data, chains: Sequence[Chain], policy: SelectionPolicy) -> list[Fit]:
+    """Return fits of second-order motors that begin at guesses."""
+    firsts: list[Fit] = []
+    for chain in chains:
+        scales = data.scales(math.exp(chain.values["ln_a1"] - chain.values["ln_a0"]))
+        chain = chain.with_values({"vc": max(chain.values["vc"], 0.01 * scales.volts)})
+        chain = chain.with_component(*plain_sensor(data))
+        chain = with_given(chain, data, policy.given)
+        first = fit(data, chain, scales, data.initial, rounds=2, most=SEARCH_ORDER, converged=ROUGH)
+        if all(abs(first.deviance - other.deviance) > SAME for other in firsts):
+            firsts.append(first)
+    if policy.first_order:
+        return firsts
+    return [_second_order(data, first, share) for first in firsts for share in (0.01, 0.1)]
 
 
 def plain_sensor(data: Data) -> tuple[Component, Mapping[str, float]]:
@@ -270,7 +280,8 @@ def _second_order(data: Data, first: Fit, share: float) -> Fit:
     ln_a2 = values["ln_a1"] + math.log(share * lag)
     chain = first.chain.with_component(MOTORS[1], {"ln_a2": ln_a2, "viscous": 0.1})
     return fit(
-        data, chain, data.scales(lag), first.initial, first.noise, rounds=1, most=SEARCH_ORDER
+        data, chain, data.scales(lag), first.initial, first.noise, rounds=1, most=SEARCH_ORDER,
+        converged=ROUGH,
     )
 
 
@@ -296,18 +307,20 @@ def _with_current(data: Data, found: Fit) -> Fit:
                 best = rest, chain.with_values(at)
     if best is None:
         raise CurrentError("the current does not follow from voltage and motion")
-    return fit(data, best[1], found.scales, found.initial, rounds=2, most=SEARCH_ORDER)
+    return fit(
+        data, best[1], found.scales, found.initial, rounds=2, most=SEARCH_ORDER, converged=ROUGH
+    )
 
 
 def quick(data: Data, chain: Chain, like: Fit) -> Fit:
     """Return a fit that is good enough to be compared, under the noise of another."""
-    return descend(data, chain, like.scales, like.initial, like.noise, most=10, converged=0.3)
+    return descend(data, chain, like.scales, like.initial, like.noise, most=10, converged=ROUGH)
 
 
 def _renewed(data: Data, found: Fit) -> Fit:
     """Return the fit under the noise of its own residual."""
     noise = noises(data, found.linear, SEARCH_ORDER)
-    return descend(data, found.chain, found.scales, found.initial, noise, most=8, converged=0.3)
+    return descend(data, found.chain, found.scales, found.initial, noise, most=8, converged=ROUGH)
 
 
 def _best_addition(found: Fit, data: Data, policy: SelectionPolicy, say: Say) -> Fit | None:
@@ -385,6 +398,8 @@ def _without_needless(found: Fit, data: Data, policy: SelectionPolicy) -> Fit:
     while True:
         best: tuple[float, Fit] | None = None
         for one, plainer in _optional(found, data):
+            if _deviations(found, one) > CERTAIN:
+                continue
             bare = quick(data, plainer, found)
             net = policy.price(one, 100.0) - gain_of(data, bare.linear, found.linear.residual)
             if net > 0 and (best is None or net > best[0]):
@@ -392,6 +407,16 @@ def _without_needless(found: Fit, data: Data, policy: SelectionPolicy) -> Fit:
         if best is None:
             return found
         found = best[1]
+
+
+def _deviations(found: Fit, one: Component) -> float:
+    """Return the distance of a component's size from none, in standard deviations."""
+    p = next((p for p in one.parameters if p.name == one.linear and p.name in found.names), None)
+    if p is None:
+        return 0.0
+    k = found.names.index(p.name)
+    off = found.chain.values[p.name] - p.neutral * found.scales.of(p.unit)
+    return float(abs(off) / math.sqrt(found.covariance[k, k]))
 
 
 def prune(data: Data, found: Fit) -> Fit:

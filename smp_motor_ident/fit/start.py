@@ -27,6 +27,7 @@ DELAYS = (0.0, 1.0, 3.0)  # rows
 LONG_DELAYS = (10.0, 20.0, 40.0, 80.0, 160.0, 320.0)  # rows
 POOR = 0.1  # share of the output's energy that a start leaves, from which long delays are tried
 ROWS = 3000
+NEAR = 0.5  # difference of a logarithm between two starts, at least
 
 
 class _LongDelay(Delay):
@@ -49,7 +50,18 @@ def guesses(data: Data, best: int = 3, component: Component | None = None) -> li
         if component is None and min((cost for cost, _ in scored), default=1.0) > POOR:
             scored += _scored(view, _LongDelay(), (0.0,))
     scored.sort(key=lambda one: one[0])
-    return [chain for _, chain in scored[:best]]
+    found: list[Chain] = []
+    for _, chain in scored:
+        if len(found) < best and not any(_are_near(chain, other) for other in found):
+            found.append(chain)
+    return found
+
+
+def _are_near(one: Chain, other: Chain) -> bool:
+    """Tell whether fits from two motors would end at the same."""
+    names = ("ln_a0", "ln_a1")
+    near = all(abs(one.values[n] - other.values[n]) < NEAR for n in names)
+    return near and one.values.get("delay") == other.values.get("delay")
 
 
 def views(data: Data) -> Iterator[Data]:

@@ -22,13 +22,12 @@ from smp_motor_ident.chain.motor import Delay, Friction
 from smp_motor_ident.chain.quantities import REPORTED
 from smp_motor_ident.fit.adequacy import scatters
 from smp_motor_ident.fit.data import SEARCH_ROWS, Data
-from smp_motor_ident.fit.descend import Fit, restate
+from smp_motor_ident.fit.descend import Fit, residual, restate
 from smp_motor_ident.fit.search import (
     SelectionPolicy,
     candidates,
     quick,
     relabelled,
-    residual_of,
     typical_size,
 )
 from smp_motor_ident.infer.instrument_limits import TIMING_ACCURACY
@@ -111,7 +110,7 @@ def of_timing(data: Data, found: Fit, seconds: float) -> list[Contribution]:
     if found.chain.has("delay"):
         return []
     late = 0.1 * data.sample
-    r = residual_of(data, found.chain.with_component(Delay(), {"delay": late}), found)
+    r = residual(data, found.chain.with_component(Delay(), {"delay": late}), found)
     if r is None:
         return []
     m = found.linear.row.size
@@ -164,7 +163,7 @@ def considered(data: Data, found: Fit, rows: float = 1.0) -> list[Contribution]:
 def _considered(
     one: Component, chain: Chain, data: Data, found: Fit, policy: SelectionPolicy, rows: float
 ) -> tuple[float, Contribution] | None:
-    r = residual_of(data, chain, found)
+    r = residual(data, chain, found)
     if r is None:
         return None
     base, m = found.linear.residual, found.linear.row.size

@@ -39,19 +39,19 @@ def _fast_decay(te: float, command: float, emf: float, supply: float, diodes: fl
 
 @compiled
 def terminal_voltage(
-    b: int, command: float, emf: float, age: float, full_duty: float, lanes: Array
+    command: float, emf: float, age: float, full_duty: float, lane: Array
 ) -> float:
-    """Return the voltage at the terminals of lane ``b`` [V] for a command and a back-EMF [V]."""
-    out: float = command * (1.0 - lanes[DECLINE, b] * age)
+    """Return the voltage at the terminals of a lane [V] for a command and a back-EMF [V]."""
+    out: float = command * (1.0 - lane[DECLINE] * age)
     if command == 0.0:
-        out += lanes[FREE, b] * emf
+        out += lane[FREE] * emf
         return out
-    if lanes[DECAY, b] > 0.0:
-        out = _fast_decay(lanes[DECAY, b], out, emf, full_duty, lanes[DIODES, b])
+    if lane[DECAY] > 0.0:
+        out = _fast_decay(lane[DECAY], out, emf, full_duty, lane[DIODES])
     drive: float = out - emf
-    duty = command / full_duty
-    drive /= 1.0 + lanes[SAG, b] * duty * duty
-    drop = lanes[DROP, b]
+    if lane[SAG] != 0.0:
+        duty = command / full_duty
+        drive /= 1.0 + lane[SAG] * duty * duty
+    drop, most = lane[DROP], lane[CURRENT_LIMIT]
     drive -= min(max(drive, -drop), drop)
-    most: float = lanes[CURRENT_LIMIT, b]
     return emf + min(max(drive, -most), most)

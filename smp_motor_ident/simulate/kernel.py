@@ -32,8 +32,7 @@ from smp_motor_ident.simulate.lanes import (
     K,
 )
 
-STATES = 3  # q, w, th
-ENTRIES = 12  # of a transition: E (q<-q, q<-w, w<-q, w<-w), th<-q, th<-w, then q, w, th <- v, F
+ENTRIES = 12  # of a transition: of q, w and th at its end by q, w, voltage and force
 EVENTS = 60  # of friction within one piece, at most
 STUCK = 0.0
 
@@ -75,21 +74,21 @@ def _flow(
 
 @compiled
 def transitions(lengths: Array, lanes: Array) -> Array:
-    """Return the transition of every length and lane, shape (lengths, 12, lanes).
+    """Return the transition of every lane and length, shape (lanes, lengths, 12).
 
     ``lengths`` has shape (lengths, lanes) [s].
     """
-    out = np.empty((lengths.shape[0], ENTRIES, lanes.shape[1]))
-    for n in range(lengths.shape[0]):
-        for b in range(lanes.shape[1]):
-            te, tm, k, be = lanes[TE, b], lanes[TM, b], lanes[K, b], lanes[BE, b]
+    out = np.empty((lanes.shape[1], lengths.shape[0], ENTRIES))
+    for b in range(lanes.shape[1]):
+        te, tm, k, be = lanes[TE, b], lanes[TM, b], lanes[K, b], lanes[BE, b]
+        for n in range(lengths.shape[0]):
             h = lengths[n, b]
             at = 0
             for q, w, v, f in ((1.0, 0.0, 0.0, 0.0), (0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0),
                                (0.0, 0.0, 0.0, 1.0)):  # fmt: skip
                 q1, w1, th = _flow(q, w, h, v, f, te, tm, k, be)
-                out[n, at, b], out[n, at + 1, b], out[n, at + 2, b] = q1, w1, th
-                at += 3
+                out[b, n, at], out[b, n, at + 4], out[b, n, at + 8] = q1, w1, th
+                at += 1
     return out
 
 
@@ -141,15 +140,14 @@ def _crossing(
 
 @compiled
 def _advance(
-    b: int, h: float, v: float, load: float, direction: float, hold: float, x: Array, lanes: Array
-) -> float:
-    """Advance one lane under friction through all events; return its direction of motion.
+    q: float, w: float, th: float, direction: float, h: float, v: float, load: float,
+    plus: float, minus: float, hold: float, te: float, tm: float, k: float, be: float,
+) -> tuple[float, float, float, float]:  # fmt: skip
+    """Advance under friction through all events; return q, w, th and the direction of motion.
 
     ``hold``: friction at standstill over that in motion.
     """
-    te, tm, k, be = lanes[TE, b], lanes[TM, b], lanes[K, b], lanes[BE, b]
-    plus, minus = lanes[VC_PLUS, b], lanes[VC_MINUS, b]
-    q, w, th, left = x[0, b], x[1, b], x[2, b], h
+    left = h
     for _ in range(EVENTS):
         if direction == STUCK:
             drive, end = (q if te > 0.0 else v) - load, v - load
@@ -181,8 +179,7 @@ def _advance(
         left -= t
         if left <= 1e-14 * h:
             break
-    x[0, b], x[1, b], x[2, b] = q, w, th
-    return direction
+    return q, w, th, direction
 
 
 @compiled
@@ -216,9 +213,9 @@ def run(  # noqa: C901 - one pass, kept whole so that nothing is stored between 
     length, edges, group, section : ndarray, shape (pieces,)
         Of every piece: its length [s]; by how many shifts a lane's own is longer; its transition in
         ``tables`` or -1; its column of ``command``.
-    command : ndarray, shape (sections, lanes or 1)
+    command : ndarray, shape (lanes or 1, sections)
         Voltage [V] of every section.
-    tables, halves : ndarray, shape (groups, 12, lanes)
+    tables, halves : ndarray, shape (lanes, groups, 12)
         From `transitions`, over whole and half pieces; the latter only where there is feedback.
     lanes : ndarray, shape (parameters, lanes)
         Parameters, in the order of `simulate.lanes`.
@@ -234,112 +231,86 @@ def run(  # noqa: C901 - one pass, kept whole so that nothing is stored between 
         Command [V] at which the driver is always on.
     age : ndarray, shape (pieces or 0,)
         Share of the record that has passed at every piece, for parameters that drift.
-    out, volts : ndarray, shape (n, 3, lanes) and (n or 0, lanes)
+    out, volts : ndarray, shape (3, lanes, n) and (lanes, n or 0)
         Filled: q, w, th at every row; mean terminal voltage over the row.
     """
-    count = lanes.shape[1]
-    x, before = np.zeros((STATES, count)), np.zeros((STATES, count))
-    direction, force, v = np.zeros(count), np.zeros(count), np.zeros(count)
-    load, hold = np.zeros(count), np.ones(count)
-    shared = command.shape[1] == 1
-    for g in range(segment.shape[0] - 1):
-        for b in range(count):
-            for n in range(STATES):
-                x[n, b] = initial[g, n] + own[n, b]
-            load[b] = lanes[LOAD, b] + initial[g, 3] + own[3, b]
-            direction[b] = 1.0
-            if friction:
-                direction[b] = STUCK if x[1, b] == 0.0 else (1.0 if x[1, b] > 0.0 else -1.0)
-        for k in range(segment[g], segment[g + 1]):
-            gathered = 0.0
-            if volts.shape[0] > 0:
-                volts[k, :] = 0.0
-            for j in range(first_piece[k], first_piece[k + 1]):
-                h, at = length[j], section[j]
-                if h <= 0.0 and edges[j] == 0:
-                    continue
-                gathered += h
-                for b in range(count):
-                    v[b] = command[at, 0 if shared else b]
-                    before[0, b], before[1, b], before[2, b] = x[0, b], x[1, b], x[2, b]
-                    force[b] = load[b]
-                if feedback:
-                    now = age[j] if age.shape[0] > 0 else 0.0
-                    half = halves[max(group[j], 0)]
-                    for b in range(count):
-                        _respond(
-                            b, h, now, full_duty, direction, x, lanes, v, force, half, group[j] >= 0
+    for b in range(lanes.shape[1]):
+        lane = lanes[:, b].copy()
+        te, tm, k, be = lane[TE], lane[TM], lane[K], lane[BE]
+        plus, minus, hold, passed = lane[VC_PLUS], lane[VC_MINUS], 1.0 + lane[STRIBECK], 0.0
+        voltage = command[min(b, command.shape[0] - 1)]
+        for g in range(segment.shape[0] - 1):
+            q, w = initial[g, 0] + own[0, b], initial[g, 1] + own[1, b]
+            th, load = initial[g, 2] + own[2, b], lane[LOAD] + initial[g, 3] + own[3, b]
+            direction, v = _sign(w), 0.0
+            for row in range(segment[g], segment[g + 1]):
+                put = gathered = 0.0
+                for j in range(first_piece[row], first_piece[row + 1]):
+                    h = length[j] + edges[j] * shift[b]
+                    if h <= 0.0:
+                        continue
+                    v, force = voltage[section[j]], load
+                    if age.shape[0] > 0:
+                        passed = age[j]
+                        scale = 1.0 + lane[FRICTION_DRIFT] * passed
+                        plus, minus = lane[VC_PLUS] * scale, lane[VC_MINUS] * scale
+                    dry = plus if direction > 0.0 else -minus if direction < 0.0 else 0.0
+                    kind = group[j]
+                    if feedback:
+                        u = v
+                        v = terminal_voltage(u, k * w, passed, full_duty, lane)
+                        force = load + extra_force(w, dry, passed, lane)
+                        if direction != STUCK or not friction:
+                            f = force + dry
+                            if kind >= 0:
+                                middle = _after(halves, b, kind, 4, q, w, v, f)
+                            else:
+                                _, middle, _ = _flow(q, w, 0.5 * h, v, f, te, tm, k, be)
+                            if friction and middle * direction < 0.0:
+                                middle = 0.0
+                            v = terminal_voltage(u, k * middle, passed, full_duty, lane)
+                            force = load + extra_force(middle, dry, passed, lane)
+                    put += h * v
+                    gathered += h
+                    if friction and direction == STUCK:
+                        q, w, th, direction = _advance(
+                            q, w, th, direction, h, v, force, plus, minus, hold, te, tm, k, be
                         )
-                        hold[b] = (1.0 + lanes[STRIBECK, b]) * (
-                            1.0 + lanes[FRICTION_DRIFT, b] * now
+                        continue
+                    f = force + dry
+                    if kind >= 0:
+                        q1 = _after(tables, b, kind, 0, q, w, v, f)
+                        w1 = _after(tables, b, kind, 4, q, w, v, f)
+                        th1 = th + _after(tables, b, kind, 8, q, w, v, f)
+                    else:
+                        q1, w1, turned = _flow(q, w, h, v, f, te, tm, k, be)
+                        th1 = th + turned
+                    # A dip through zero needs a speed that the first slope uses up.
+                    if friction and (
+                        w1 * direction <= 0.0
+                        or te > 0.0
+                        and (tm * w + h * (q - be * w - f)) * direction <= 0.0
+                    ):
+                        q, w, th, direction = _advance(
+                            q, w, th, direction, h, v, force, plus, minus, hold, te, tm, k, be
                         )
-                alone = group[j] < 0
-                if not alone:
-                    e = tables[group[j]]
-                    for b in range(count):
-                        f = force[b]
-                        if friction:
-                            f += lanes[VC_PLUS, b] * max(direction[b], 0.0)
-                            f += lanes[VC_MINUS, b] * min(direction[b], 0.0)
-                        q, w = before[0, b], before[1, b]
-                        x[0, b] = e[0, b] * q + e[3, b] * w + e[6, b] * v[b] + e[9, b] * f
-                        x[1, b] = e[1, b] * q + e[4, b] * w + e[7, b] * v[b] + e[10, b] * f
-                        x[2, b] += e[2, b] * q + e[5, b] * w + e[8, b] * v[b] + e[11, b] * f
-                if alone or friction:
-                    for b in range(count):
-                        own_h = h + edges[j] * shift[b]
-                        if own_h < 0.0:
-                            own_h = 0.0
-                        d = direction[b]
-                        if not friction:
-                            x[0, b], x[1, b], turned = _flow(
-                                before[0, b], before[1, b], own_h, v[b], force[b],
-                                lanes[TE, b], lanes[TM, b], lanes[K, b], lanes[BE, b],
-                            )  # fmt: skip
-                            x[2, b] = before[2, b] + turned
-                            continue
-                        if not alone and d != STUCK and x[1, b] * d > 0.0:
-                            # A dip through zero needs a speed that the first slope uses up.
-                            tm, te = lanes[TM, b], lanes[TE, b]
-                            q0 = before[0, b] if te > 0.0 else v[b] - lanes[K, b] * before[1, b]
-                            f = force[b] + (lanes[VC_PLUS, b] if d > 0.0 else -lanes[VC_MINUS, b])
-                            slope = (q0 - lanes[BE, b] * before[1, b] - f) / tm
-                            if before[1, b] * d + slope * d * own_h > 0.0:
-                                continue
-                        for n in range(STATES):
-                            x[n, b] = before[n, b]
-                        direction[b] = _advance(b, own_h, v[b], force[b], d, hold[b], x, lanes)
-                if volts.shape[0] > 0:
-                    for b in range(count):
-                        volts[k, b] += max(h + edges[j] * shift[b], 0.0) * v[b]
-            for b in range(count):
-                out[k, 0, b], out[k, 1, b], out[k, 2, b] = x[0, b], x[1, b], x[2, b]
-                if lanes[TE, b] == 0.0:
-                    out[k, 0, b] = v[b] - lanes[K, b] * x[1, b]
-                if volts.shape[0] > 0 and gathered > 0.0:
-                    volts[k, b] /= gathered
+                        continue
+                    q, w, th = q1, w1, th1
+                out[0, b, row] = q if te > 0.0 else v - k * w
+                out[1, b, row], out[2, b, row] = w, th
+                if volts.shape[1] > 0:
+                    volts[b, row] = put / gathered if gathered > 0.0 else 0.0
 
 
 @inlined
-def _respond(
-    b: int, h: float, age: float, full_duty: float, direction: Array, x: Array, lanes: Array,
-    v: Array, force: Array, half: Array, tabulated: bool,
-) -> None:  # fmt: skip
-    """Put the voltage at the terminals and the forces that follow the motion, at mid-piece."""
-    q, w, d = x[0, b], x[1, b], direction[b]
-    k = lanes[K, b]
-    base, command = force[b], v[b]
-    v[b] = terminal_voltage(b, command, k * w, age, full_duty, lanes)
-    force[b] = base + extra_force(b, w, d, age, lanes)
-    if d == STUCK:
-        return
-    f = force[b] + (lanes[VC_PLUS, b] if d > 0.0 else -lanes[VC_MINUS, b])
-    if tabulated:
-        middle = half[1, b] * q + half[4, b] * w + half[7, b] * v[b] + half[10, b] * f
-    else:
-        te, tm, be = lanes[TE, b], lanes[TM, b], lanes[BE, b]
-        _, middle, _ = _flow(q, w, 0.5 * h, v[b], f, te, tm, k, be)
-    if middle * d < 0.0:
-        middle = 0.0
-    v[b] = terminal_voltage(b, command, k * middle, age, full_duty, lanes)
-    force[b] = base + extra_force(b, middle, d, age, lanes)
+def _sign(w: float) -> float:
+    return 1.0 if w > 0.0 else -1.0 if w < 0.0 else STUCK
+
+
+@inlined
+def _after(
+    tables: Array, b: int, kind: int, at: int, q: float, w: float, v: float, f: float
+) -> float:
+    """Return one output of a tabulated transition."""
+    moved: float = tables[b, kind, at] * q + tables[b, kind, at + 1] * w
+    return moved + (tables[b, kind, at + 2] * v + tables[b, kind, at + 3] * f)

@@ -54,7 +54,7 @@ def simulate(
         Where the outputs are wanted, and where the command switches.
     lanes : ndarray, shape (parameters, lanes)
         Parameters, in the order of `simulate.lanes`.
-    command : ndarray, shape (n, lanes) or (n, 1)
+    command : ndarray, shape (sections, lanes) or (sections, 1)
         Voltage [V] of every section.
     initial : ndarray, shape (segments, 4)
         q [V], speed, angle and load [V] at the beginning of every segment.
@@ -78,27 +78,25 @@ def simulate(
     lengths = np.maximum(pieces.grouped[:, None] + pieces.grouped_edges[:, None] * moved, 0.0)
     tables = transitions(lengths, lanes)
     feedback = follows_motion(lanes)
-    halves = transitions(0.5 * lengths, lanes) if feedback and lengths.size else tables[:0]
-    if not halves.size:
-        halves = np.zeros((1, 12, count))
+    halves = transitions(0.5 * lengths, lanes) if feedback else tables
     friction = bool((lanes[[at.VC_PLUS, at.VC_MINUS]] != 0).any())
     age: Array = np.zeros(0)
     if (lanes[[at.DECLINE, at.FRICTION_DRIFT, at.LOAD_STEP]] != 0).any():
         age = np.repeat(rows.age, np.diff(pieces.first))
-    out = np.empty((len(rows), 3, count))
-    volts = np.zeros((len(rows) if charge else 0, count))
+    out = np.empty((3, count, len(rows)))
+    volts = np.zeros((count, len(rows) if charge else 0))
     run(
         pieces.first, pieces.length, pieces.edges, pieces.group, pieces.section,
-        np.ascontiguousarray(command), tables, halves, np.ascontiguousarray(lanes), moved,
+        np.ascontiguousarray(command.T), tables, halves, np.ascontiguousarray(lanes), moved,
         rows.segment, initial, added, friction, feedback, full_duty, age, out, volts,
     )  # fmt: skip
-    drive, speed, angle = out[:, 0], out[:, 1], out[:, 2]
+    drive, speed, angle = out
     gathered = volts
     if charge:
         first = np.repeat(rows.segment[:-1], np.diff(rows.segment))
-        put = np.cumsum(volts * rows.interval[:, None], axis=0)
-        gathered = put - put[first] - lanes[at.TE] * (drive - drive[first])
-        gathered -= lanes[at.K] * (angle - angle[first])
+        put = np.cumsum(volts * rows.interval, axis=1)
+        gathered = put - put[:, first] - lanes[at.TE, :, None] * (drive - drive[:, first])
+        gathered -= lanes[at.K, :, None] * (angle - angle[:, first])
     last = np.maximum(pieces.first[1:] - 1, 0)
     duty = command[pieces.section[last], :1] / full_duty
-    return Motion(drive, speed, angle, gathered, duty)
+    return Motion(drive.T, speed.T, angle.T, gathered.T, duty)

@@ -75,8 +75,8 @@ class Case:
     def breakaway(self) -> float:
         """Least command [V] at which the motor must turn, whatever load there is; the supply's."""
         commands = np.linspace(0.0, self.problem.loop.supply_voltage, 256)
-        numbers, lanes = self.driver.numbers, self.driver.lanes
-        volts = [put_out(numbers, lanes, v, 0.0, v, 1.0)[0] for v in commands.tolist()]
+        numbers, lane = self.driver.numbers, self.driver.lane
+        volts = [put_out(numbers, lane, v, 0.0, v, 1.0)[0] for v in commands.tolist()]
         enough = int(np.searchsorted(volts, self.friction.planned + self.load))
         return float(commands[min(enough, commands.size - 1)])
 

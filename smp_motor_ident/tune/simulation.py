@@ -106,7 +106,7 @@ def simulate(
         still if inputs.load is None else np.broadcast_to(inputs.load, (n, steps)),
         np.zeros(n) if friction is None else np.ascontiguousarray(friction),
         modelled, np.full(n, count_angle), speed_step, np.full(n, eccentric),
-        np.ascontiguousarray(noise), np.ascontiguousarray(of_angle), driver.numbers, driver.lanes,
+        np.ascontiguousarray(noise), np.ascontiguousarray(of_angle), driver.numbers, driver.lane,
         np.broadcast_to(plant.motors.a0, n),
     )  # fmt: skip
     return Response(*found)
@@ -187,7 +187,7 @@ def _run(
     noise: Array,
     angle_noise: Array,
     driver: Array,
-    lanes: Array,
+    lane: Array,
     back_emf: Array,
 ) -> tuple[Array, Array, NDArray[np.bool_]]:
     n, m, s = taps.shape
@@ -220,7 +220,7 @@ def _run(
             for q in range(m - 1, 0, -1):
                 past[q], given_out[q] = past[q - 1], given_out[q - 1]
             past[0] = given
-            given_out[0], last = put_out(driver, lanes, given, back_emf[j] * x[0], last, T)
+            given_out[0], last = put_out(driver, lane, given, back_emf[j] * x[0], last, T)
             drag = _drag(x[0], friction[j], given_out, taps_angle[j], load[j, k])
             swept = 0.0
             following[:] = 0.0
