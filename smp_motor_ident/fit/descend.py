@@ -273,7 +273,10 @@ def descend(
     data: Data, chain: Chain, scales: Scales, initial: Array, noise: Sequence[Noise],
     most: int = MAX_STEPS, converged: float = CONVERGED,
 ) -> Fit:  # fmt: skip
-    """Return the chain at the nearest minimum of the whitened sum of squares."""
+    """Return the chain at the nearest minimum of the whitened sum of squares.
+
+    It ends where a step changes the deviance by no more than ``converged``.
+    """
     at, start = chain, initial.copy()
     linear = linearise(data, at, scales, start, noise)
     damping = 1e-4
@@ -292,14 +295,15 @@ def descend(
         trial_start = _settled(start, linear, taken)
         following = linearise(data, trial, scales, trial_start, noise)
         gained = linear.cost - following.cost
+        least = converged * min(linear.cost / linear.row.size, 1.0)
         if np.isfinite(following.cost) and gained >= -1e-9 * linear.cost:
             at, start, linear = trial, trial_start, following
             damping = max(damping / 10, 1e-12)
-            if expected < converged and gained < converged:
+            if expected < least and gained < least:
                 break
         else:
             damping = max(damping * 10, 1e-2)
-            if damping > MOST_DAMPING or expected < converged:
+            if damping > MOST_DAMPING or expected < least:
                 break
     return Fit(at, scales, start, tuple(noise), linear, _deviance(data, linear, noise))
 
@@ -364,17 +368,17 @@ def fit(
         noise = [Noise.white(float(np.nanstd(y)) or 1.0) for y in data.outputs]
         if data.is_angle:
             noise[0] = Noise.integrated(float(np.nanstd(data.speed)) * data.rows.step or 1.0)
-        found = descend(data, chain, scales, initial, noise, most=20, converged=1e-6)
+        found = descend(data, chain, scales, initial, noise, most=20, converged=1.0)
         chain, initial = found.chain, found.initial
         noise = noises(data, found.linear, most)
     found = descend(data, chain, scales, initial, noise, most=8, converged=1.0)
-    for k in range(rounds):
+    for _ in range(rounds):
         noise = noises(data, found.linear, most)
         other = descend(data, found.chain, scales, found.initial, noise, converged=converged)
         gained = _information_criterion(data, found) - _information_criterion(data, other)
-        if gained > 0 or k == 0:
+        if gained > 0:
             found = other
-        if gained < 0.1:
+        if gained < 10 * converged:
             break
     return found
 

@@ -34,10 +34,14 @@ from smp_motor_ident.fit.start import guesses
 
 SEARCH_ORDER = 2
 """Order of the noise model during the search; a higher one would absorb missing components."""
+HOPELESS = 0.25
+"""Deviance per row by which a first-order motor is worse than one that inductance may improve."""
 SAME = 1.0
 """Difference in deviance of two fits that ended at one minimum."""
 RESOLVED = 1.1
 """Residual over the rounding of an encoder up to which it is rounding."""
+CLEARLY = 0.3
+"""Gain by screening over that of another's fit, below which a component waits for it."""
 ROUGH = 0.3
 """Change of the deviance at which a fit of the search ends."""
 CERTAIN = 20.0
@@ -246,12 +250,14 @@ def _begun(data: Data, chains: Sequence[Chain], policy: SelectionPolicy) -> list
         chain = chain.with_values({"vc": max(chain.values["vc"], 0.01 * scales.volts)})
         chain = chain.with_component(*plain_sensor(data))
         chain = with_given(chain, data, policy.given)
-        first = fit(data, chain, scales, data.initial, rounds=2, most=SEARCH_ORDER, converged=ROUGH)
+        first = fit(data, chain, scales, data.initial, most=SEARCH_ORDER, converged=ROUGH)
         if all(abs(first.deviance - other.deviance) > SAME for other in firsts):
             firsts.append(first)
     if policy.first_order:
         return firsts
-    return [_second_order(data, first, share) for first in firsts for share in (0.01, 0.1)]
+    best = min((first.deviance for first in firsts), default=0.0)
+    close = [first for first in firsts if first.deviance < best + HOPELESS * len(data)]
+    return [_second_order(data, first) for first in close]
 
 
 def plain_sensor(data: Data) -> tuple[Component, Mapping[str, float]]:
@@ -273,15 +279,19 @@ def with_given(chain: Chain, data: Data, given: Mapping[str, float]) -> Chain:
     return chain
 
 
-def _second_order(data: Data, first: Fit, share: float) -> Fit:
+def _second_order(data: Data, first: Fit) -> Fit:
     """Return the fit of a second-order motor that begins at a first-order one."""
     values = first.chain.values
     lag = math.exp(values["ln_a1"] - values["ln_a0"])
-    ln_a2 = values["ln_a1"] + math.log(share * lag)
-    chain = first.chain.with_component(MOTORS[1], {"ln_a2": ln_a2, "viscous": 0.1})
+    scales = data.scales(lag)
+    begun = []
+    for share in (0.01, 0.1):
+        ln_a2 = values["ln_a1"] + math.log(share * lag)
+        chain = first.chain.with_component(MOTORS[1], {"ln_a2": ln_a2, "viscous": 0.1})
+        begun.append(descend(data, chain, scales, first.initial, first.noise, most=4))
+    best = min(begun, key=lambda f: f.linear.cost)
     return fit(
-        data, chain, data.scales(lag), first.initial, first.noise, rounds=1, most=SEARCH_ORDER,
-        converged=ROUGH,
+        data, best.chain, scales, best.initial, best.noise, most=SEARCH_ORDER, converged=ROUGH
     )
 
 
@@ -308,7 +318,7 @@ def _with_current(data: Data, found: Fit) -> Fit:
     if best is None:
         raise CurrentError("the current does not follow from voltage and motion")
     return fit(
-        data, best[1], found.scales, found.initial, rounds=2, most=SEARCH_ORDER, converged=ROUGH
+        data, best[1], found.scales, found.initial, most=SEARCH_ORDER, converged=ROUGH
     )
 
 
@@ -340,6 +350,8 @@ def _fitted(
         if not found.chain.has(one.code)
     ]
     for candidate in (*promising, *others):
+        if best is not None and candidate.gain < CLEARLY * best[0]:
+            continue  # the next round screens it again
         say(f"fitting {candidate.component.title}")
         one = quick(data, candidate.chain, found)
         net = gain_of(data, found.linear, one.linear.residual) - candidate.price
