@@ -250,7 +250,7 @@ def _begun(data: Data, chains: Sequence[Chain], policy: SelectionPolicy) -> list
         chain = chain.with_values({"vc": max(chain.values["vc"], 0.01 * scales.volts)})
         chain = chain.with_component(*plain_sensor(data))
         chain = with_given(chain, data, policy.given)
-        first = fit(data, chain, scales, data.initial, most=SEARCH_ORDER, converged=ROUGH)
+        first = fit(data, chain, scales, data.initial, rounds=2, most=SEARCH_ORDER, converged=ROUGH)
         if all(abs(first.deviance - other.deviance) > SAME for other in firsts):
             firsts.append(first)
     if policy.first_order:
@@ -291,8 +291,9 @@ def _second_order(data: Data, first: Fit) -> Fit:
         begun.append(descend(data, chain, scales, first.initial, first.noise, most=4))
     best = min(begun, key=lambda f: f.linear.cost)
     return fit(
-        data, best.chain, scales, best.initial, best.noise, most=SEARCH_ORDER, converged=ROUGH
-    )
+        data, best.chain, scales, best.initial, best.noise, rounds=1, most=SEARCH_ORDER,
+        converged=ROUGH,
+    )  # fmt: skip
 
 
 def _with_current(data: Data, found: Fit) -> Fit:
@@ -318,7 +319,7 @@ def _with_current(data: Data, found: Fit) -> Fit:
     if best is None:
         raise CurrentError("the current does not follow from voltage and motion")
     return fit(
-        data, best[1], found.scales, found.initial, most=SEARCH_ORDER, converged=ROUGH
+        data, best[1], found.scales, found.initial, rounds=2, most=SEARCH_ORDER, converged=ROUGH
     )
 
 

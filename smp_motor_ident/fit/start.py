@@ -23,8 +23,7 @@ from smp_motor_ident.simulate.rows import Rows
 
 LAGS = 28
 FRICTIONS = (0.0, 0.04, 0.12, 0.3)  # of the largest command
-DELAYS = (0.0, -1.0, 1.0, 3.0)  # rows
-CAUTION = 2.0  # factor by which a delay must reduce the cost to be part of a start
+DELAYS = (0.0, 1.0, 3.0)  # rows
 LONG_DELAYS = (10.0, 20.0, 40.0, 80.0, 160.0, 320.0)  # rows
 POOR = 0.1  # share of the output's energy that a start leaves, from which long delays are tried
 ROWS = 3000
@@ -167,13 +166,9 @@ def _scored(
                 gain = (x * speed[ok, None]).sum(axis=0)
                 gain /= np.maximum(np.square(x).sum(axis=0), 1e-300)
                 cost = np.square(speed[ok, None] - gain * x).sum(axis=0) / energy
-                if delay:
-                    cost = cost * CAUTION
                 for k in np.flatnonzero((gain > 0) & np.isfinite(cost)):
                     found = {n: float(v[k]) for n, v in values.items()}
                     found |= {"ln_a0": -math.log(gain[k]), "ln_a1": math.log(lags[k] / gain[k])}
-                    start = chain.with_values({n: found[n] for n in chain.values})
-                    if delay:
-                        start = start.with_component(Delay(), {"delay": found["delay"]})
-                    scored.append((float(cost[k]), start))
+                    kept = {n: found[n] for n in chain.values}
+                    scored.append((float(cost[k]), chain.with_values(kept)))
     return scored

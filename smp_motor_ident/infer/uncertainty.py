@@ -149,15 +149,16 @@ def considered(data: Data, found: Fit, rows: float = 1.0) -> list[Contribution]:
     A component of size s moves the parameters by ``g s``.  The data put s at ``m`` with variance v,
     of a prior of variance t^2; it is there with the probability w that follows from the prior odds
     and the gain in likelihood: ``w g g^T (m^2 + v)``.  ``rows``: rows of the recording for each of
-    those that are looked at.
+    those that are looked at.  Of an effect that is proportional to its size, the smallest is taken.
     """
     policy = replace(SelectionPolicy(), extra=0.0)
-    best: dict[str, tuple[float, Contribution]] = {}
+    best: dict[str, tuple[float, float, Contribution]] = {}
     for one, chain in candidates(found, data):
         part = _considered(one, chain, data, found, policy, rows)
-        if part is not None and (one.code not in best or part[0] > best[one.code][0]):
-            best[one.code] = part
-    return [c for _, c in best.values()]
+        small = typical_size(one, chain, found) if one.linear else 0.0
+        if part is not None and (one.code not in best or (small, part[0]) > best[one.code][:2]):
+            best[one.code] = small, *part
+    return [part for *_, part in best.values()]
 
 
 def _considered(
