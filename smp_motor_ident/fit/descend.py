@@ -291,6 +291,8 @@ def descend(
         values = _moved(at, scales, step)
         taken = np.array([values[p.name] - at.values[p.name] for p in at.free])
         expected = float(taken @ (2 * linear.columns.T @ linear.residual - linear.normal @ taken))
+        if 0 <= expected < 0.1 * min(CONVERGED, converged):
+            break
         trial = at.with_values(values)
         trial_start = _settled(start, linear, taken)
         following = linearise(data, trial, scales, trial_start, noise)
@@ -372,15 +374,31 @@ def fit(
         chain, initial = found.chain, found.initial
         noise = noises(data, found.linear, most)
     found = descend(data, chain, scales, initial, noise, most=8, converged=1.0)
+    least = max(10 * converged, 1.0)
     for _ in range(rounds):
         noise = noises(data, found.linear, most)
+        if _likelier_by(data, found, noise) < least:
+            break
         other = descend(data, found.chain, scales, found.initial, noise, converged=converged)
         gained = _information_criterion(data, found) - _information_criterion(data, other)
         if gained > 0:
             found = other
-        if gained < 10 * converged:
+        if gained < least:
             break
     return found
+
+
+def _likelier_by(data: Data, found: Fit, noise: Sequence[Noise]) -> float:
+    """Return the decrease of the information criterion by another noise of the same residual."""
+    total = 0.0
+    every = zip(data.outputs, found.linear.simulated, data.known, strict=True)
+    for k, (measured, simulated, known) in enumerate(every):
+        rest = (measured - simulated)[None, known]
+        for sign, its in ((1, found.noise[k]), (-1, noise[k])):
+            white = its.whiten(rest, _runs(data, k, its))[0]
+            price = its.order * math.log(max(known.size, 2))
+            total += sign * (float(white @ white) + its.log_determinant(data.runs[k]) + price)
+    return total
 
 
 def refine(data: Data, found: Fit) -> Fit:
@@ -415,18 +433,23 @@ def constrain(data: Data, found: Fit, constraints: Sequence[Constraint]) -> Fit:
 
 def refit(data: Data, found: Fit) -> Fit:
     """Return the fit to other rows of the recording of a fit, under the noise that they show."""
-    begun = restate(data, found)
-    return fit(data, found.chain, found.scales, begun.initial, begun.noise)
+    begun, noise = _begun(data, found)
+    return fit(data, found.chain, found.scales, begun.initial, noise)
 
 
 def restate(data: Data, found: Fit) -> Fit:
     """Return a fit at the same values on other rows of its recording."""
+    begun, noise = _begun(data, found)
+    linear = linearise(data, found.chain, found.scales, begun.initial, noise)
+    return replace(found, initial=begun.initial, noise=tuple(noise), linear=linear)
+
+
+def _begun(data: Data, found: Fit) -> tuple[Fit, list[Noise]]:
+    """Return the initial states, and the noise, of other rows of the recording of a fit."""
     still = replace(found.chain, fixed=frozenset(p.name for p in found.chain.parameters))
-    noise = [Noise.white(float(np.nanstd(y)) or 1.0) for y in data.outputs]
-    begun = descend(data, still, found.scales, data.initial, noise)
-    shown = tuple(noises(data, begun.linear))
-    linear = linearise(data, found.chain, found.scales, begun.initial, shown)
-    return replace(found, initial=begun.initial, noise=shown, linear=linear)
+    white = [Noise.white(float(np.nanstd(y)) or 1.0) for y in data.outputs]
+    begun = descend(data, still, found.scales, data.initial, white)
+    return begun, noises(data, begun.linear)
 
 
 def settle(data: Data, chain: Chain, scales: Scales) -> Array:

@@ -34,10 +34,6 @@ from smp_motor_ident.fit.start import guesses
 
 SEARCH_ORDER = 2
 """Order of the noise model during the search; a higher one would absorb missing components."""
-HOPELESS = 0.25
-"""Deviance per row by which a first-order motor is worse than one that inductance may improve."""
-SAME = 1.0
-"""Difference in deviance of two fits that ended at one minimum."""
 RESOLVED = 1.1
 """Residual over the rounding of an encoder up to which it is rounding."""
 CLEARLY = 0.3
@@ -238,26 +234,22 @@ def _begin(data: Data, policy: SelectionPolicy) -> Fit:
     fits = _begun(motion, guesses(motion, 3), policy)
     if not fits:
         raise InsufficientExcitationError("no motor follows the voltage")
-    best = min(fits, key=lambda f: f.deviance)
-    return best if data.current is None else _with_current(data, best)
+    return fits[0] if data.current is None else _with_current(data, fits[0])
 
 
 def _begun(data: Data, chains: Sequence[Chain], policy: SelectionPolicy) -> list[Fit]:
-    """Return fits of second-order motors that begin at guesses."""
-    firsts: list[Fit] = []
+    """Return the fit that begins at the best of some guesses, if there are any."""
+    firsts = []
     for chain in chains:
         scales = data.scales(math.exp(chain.values["ln_a1"] - chain.values["ln_a0"]))
         chain = chain.with_values({"vc": max(chain.values["vc"], 0.01 * scales.volts)})
         chain = chain.with_component(*plain_sensor(data))
         chain = with_given(chain, data, policy.given)
-        first = fit(data, chain, scales, data.initial, rounds=2, most=SEARCH_ORDER, converged=ROUGH)
-        if all(abs(first.deviance - other.deviance) > SAME for other in firsts):
-            firsts.append(first)
-    if policy.first_order:
-        return firsts
-    best = min((first.deviance for first in firsts), default=0.0)
-    close = [first for first in firsts if first.deviance < best + HOPELESS * len(data)]
-    return [_second_order(data, first) for first in close]
+        firsts.append(
+            fit(data, chain, scales, data.initial, rounds=2, most=SEARCH_ORDER, converged=ROUGH)
+        )
+    firsts.sort(key=lambda f: f.deviance)
+    return firsts[:1] if policy.first_order else [_second_order(data, f) for f in firsts[:1]]
 
 
 def plain_sensor(data: Data) -> tuple[Component, Mapping[str, float]]:

@@ -51,6 +51,8 @@ CAUSES = {
 }  # fmt: skip
 """Names of the systematic uncertainty that rests on the prior of a parameter."""
 MAX_SHARES = 3
+LEAST_SHARE = 1e-6
+"""Share of a number below which a systematic uncertainty is none."""
 WORTH = 0.25
 """Systematic over random uncertainty from which it is stated."""
 
@@ -163,8 +165,10 @@ def _systematic(
             cause = "one_size_of_voltage"
             if hardware.voltage_accuracy is not None:
                 moves = moves * hardware.voltage_accuracy / ONE_SIZE_ACCURACY.value
-        moved = dict(zip(names, map(float, moves))) | dict(part.adds)
-        yield Systematic(cause, _largest(moves, values), moved)
+        share = _largest(moves, values)
+        if share > LEAST_SHARE or part.adds:
+            moved = dict(zip(names, map(float, moves))) | dict(part.adds)
+            yield Systematic(cause, share, moved)
     if "ln_r" in found.names:
         accuracy = hardware.current_accuracy
         share = CURRENT_ACCURACY.value if accuracy is None else accuracy
