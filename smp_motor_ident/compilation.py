@@ -21,7 +21,7 @@ from smp_motor_ident.estimate import estimate
 from smp_motor_ident.record import Hardware, Record
 
 STEP, SAMPLES, COUNTS = 0.01, 400, 500.0
-FEW = 100
+SHORT_SAMPLES = 100
 """Samples whose estimate takes no longer than loading the compiled functions."""
 MOTOR = MotorParameters(
     resistance=3.0, inductance=0.05, motor_constant=0.03, inertia=1.4e-5, viscous_friction=5e-5
@@ -50,7 +50,7 @@ def recording(friction: float, samples: int = SAMPLES) -> Record:
 
 def load() -> None:
     """Load what estimates of whole records call, for all processes that are forked after it."""
-    estimate(recording(1e-3, FEW), "electromechanical")
+    estimate(recording(1e-3, SHORT_SAMPLES), "electromechanical")
 
 
 def rehearse(signals: str) -> None:

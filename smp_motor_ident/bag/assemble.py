@@ -11,7 +11,7 @@ from smp_motor_control.arrays import Array, Integers
 from smp_motor_control.motor.parameters import Gearbox
 from smp_motor_ident.bag import checks, clock, counter, mapping, units
 from smp_motor_ident.bag.axis import Motor, Series, finite, on_one_axis, unwrapped
-from smp_motor_ident.bag.limits import COUNTED
+from smp_motor_ident.bag.limits import MAX_COUNT_STEP
 from smp_motor_ident.bag.storage import Table
 from smp_motor_ident.errors import BagError
 from smp_motor_ident.quality.stamps import find_beat, moves_on
@@ -115,7 +115,7 @@ def _check(motor: Motor, series: dict[str, Series]) -> None:
             count = unwrapped(motor, series).count
             value = (count - count[:1]).astype(np.float64)
             step = np.quantile(np.abs(np.diff(value)), 0.9) if value.size > 1 else 0.0
-            if step > COUNTED.value and not motor.plan.own:
+            if step > MAX_COUNT_STEP.value and not motor.plan.own:
                 raise BagError(
                     f"{motor.where}: the count moves by {step:.2g} between samples, more than an "
                     "encoder counts; map the column of its counts"
@@ -160,7 +160,7 @@ def _clock(motor: Motor) -> dict[str, Integers]:
         if t not in poor and stamp is not None
     }
     offsets = [fit.offset for fit in fits.values()]
-    if not poor and max(offsets) - min(offsets) < clock.SAME_CLOCK:
+    if not poor and max(offsets) - min(offsets) < clock.MAX_CLOCK_OFFSET_NS:
         text = "time: header stamps (the instants of sampling, free of transport delay)"
         motor.tell("time_base", text)
         _report_offset(motor, next(iter(tables)), fits)
@@ -216,7 +216,7 @@ def _stamp(motor: Motor, table: Table) -> Integers | None:
     if column is None:
         return None
     time = clock.nanoseconds(column, signal, signal.unit)
-    return np.where(time == clock.NEVER, 0, time)
+    return np.where(time == clock.MISSING_TIME, 0, time)
 
 
 def _report_offset(

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from smp_motor_control.arrays import Array, Flags, Integers
-from smp_motor_ident.bag.clock import BEATS, mean_held, recorded_at, rhythm
+from smp_motor_ident.bag.clock import BEAT_SAMPLES, mean_held, recorded_at, rhythm
 from smp_motor_ident.bag.counter import Unwrapped, angle_resets, reset_found, unwrap
 from smp_motor_ident.bag.drives import answers_in_its_row, rows_behind
 from smp_motor_ident.bag.mapping import MotorMap
@@ -245,7 +245,7 @@ def _find_gaps(
     steps, missing = np.diff(axis), beat.missing(axis)
     edges = [0, *(np.flatnonzero(steps > beat.gap()) + 1).tolist(), axis.size]
     for a, b in pairwise(edges):  # each run may have its own rate
-        if (own := rhythm(axis[a:b])).regular and b - a > BEATS:
+        if (own := rhythm(axis[a:b])).regular and b - a > BEAT_SAMPLES:
             missing[a : b - 1] = own.missing(axis[a:b])
     if alike and voltage.number is not None:  # the publisher's numbers tell losses
         missing = np.maximum(np.diff(voltage.number) - 1, 0)

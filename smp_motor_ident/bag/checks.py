@@ -6,7 +6,12 @@ from scipy.ndimage import median_filter
 
 from smp_motor_control.arrays import Array, Flags
 from smp_motor_ident.bag.axis import Series
-from smp_motor_ident.bag.limits import JUMP_SPAN, JUMP_STEP, STRAY_ROWS, UNSIGNED_CURRENT
+from smp_motor_ident.bag.limits import (
+    MAX_JUMP_SPAN,
+    MAX_JUMP_STEP,
+    MAX_STRAY_ROW_SHARE,
+    UNSIGNED_CURRENT_RATIO,
+)
 from smp_motor_ident.errors import BagError
 
 _MIN_SAMPLES = 50
@@ -30,13 +35,13 @@ def impossible(value: Array, *, steps_allowed: bool) -> Flags:
         span = max(high - low, 1e-3 * max(abs(low), abs(high)))
         step = np.abs(np.diff(x))
         usual = float(np.quantile(step[:: max(x.size // _MAX_QUANTILE_SAMPLES, 1)], 0.99))
-        if np.ptp(x) <= JUMP_SPAN.value * span and step.max() <= JUMP_STEP.value * usual:
+        if np.ptp(x) <= MAX_JUMP_SPAN.value * span and step.max() <= MAX_JUMP_STEP.value * usual:
             return none
         away = np.abs(x - median_filter(x, 5, mode="nearest"))
-        bad = (away > JUMP_SPAN.value * span) & (span > 0)
+        bad = (away > MAX_JUMP_SPAN.value * span) & (span > 0)
         if not steps_allowed:
             both = np.zeros(x.size, bool)
-            both[1:-1] = np.minimum(step[:-1], step[1:]) > JUMP_STEP.value * usual
+            both[1:-1] = np.minimum(step[:-1], step[1:]) > MAX_JUMP_STEP.value * usual
             both[1:-1] &= np.diff(x)[:-1] * np.diff(x)[1:] < 0
             bad |= both & (away > 0.5 * span) & (usual > 0)
     none[sound[bad]] = True
@@ -62,7 +67,7 @@ def is_unsigned(voltage: Series, current: Series) -> bool:
     if min(forward.mean(), backward.mean()) < 0.05:
         return False
     ahead, back = float(amperes[forward].mean()), float(amperes[backward].mean())
-    if abs(ahead + back) < UNSIGNED_CURRENT.value * abs(ahead - back):
+    if abs(ahead + back) < UNSIGNED_CURRENT_RATIO.value * abs(ahead - back):
         return False
     low, high = np.quantile(amperes, [0.05, 0.95])
     return bool(low > -0.2 * high)  # some current may return to the supply
@@ -70,7 +75,7 @@ def is_unsigned(voltage: Series, current: Series) -> bool:
 
 def has_sign(value: Array) -> bool:
     """Return whether a signal has both signs, ignoring outliers."""
-    least = STRAY_ROWS.value * np.count_nonzero(value)
+    least = MAX_STRAY_ROW_SHARE.value * np.count_nonzero(value)
     return bool(min(np.sum(value > 0), np.sum(value < 0)) > least)
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from smp_motor_control.arrays import Array, Integers
-from smp_motor_ident.bag.limits import CLOCK_LEAP, SET_BACK
+from smp_motor_ident.bag.limits import MIN_CLOCK_LEAP_S, MIN_RESTART_ROWS
 from smp_motor_ident.bag.mapping import Signal
 from smp_motor_ident.bag.storage import Table, found
 from smp_motor_ident.bag.units import UNITS
@@ -19,31 +19,32 @@ from smp_motor_ident.errors import BagError
 Parts = list[tuple[int, int]]
 """Begin and end of runs of rows."""
 
-NEVER = -(2**62)
+MISSING_TIME = -(2**62)
 """Time of a row without one."""
 
-_ROWS = round(SET_BACK.value)
+_ROWS = round(MIN_RESTART_ROWS.value)
 _BEFORE = 1000
 """Smallest number of earlier rows examined."""
 
 _SECOND = 1_000_000_000
-BEATS = 32
+BEAT_SAMPLES = 32
 """Samples that determine a beat."""
-SAME_CLOCK = 50_000_000
+MAX_CLOCK_OFFSET_NS = 50_000_000
 """Topics whose offsets differ by less [ns] share a clock; latency explains the difference."""
 
-SET = 1_000_000_000_000_000_000
+MIN_SET_CLOCK_NS = 1_000_000_000_000_000_000
 """Smallest time [ns] of a clock that was set, in 2001; smaller ones count from some start."""
 
 
 def recorded_at(logs: Iterable[Integers]) -> float | None:
     """Return the first log time of a clock that was set [s since 1970], or None."""
-    first = [int(log[log >= SET].min()) for log in logs if (log >= SET).any()]
+    dated = [log[log >= MIN_SET_CLOCK_NS] for log in logs]
+    first = [int(log.min()) for log in dated if log.size]
     return 1e-9 * min(first) if first else None
 
 
 def nanoseconds(column: NDArray[Any], signal: Signal, unit: str) -> Integers:
-    """Return a column of times [ns], `NEVER` for missing cells; the default unit is seconds.
+    """Return a column of times [ns], `MISSING_TIME` for missing cells; the default unit is seconds.
 
     Integers stay integers, since a float cannot hold nanoseconds since 1970 exactly.
     """
@@ -52,8 +53,8 @@ def nanoseconds(column: NDArray[Any], signal: Signal, unit: str) -> Integers:
     if column.dtype.kind in "iu" and factor == round(factor):
         return column.astype(np.int64) * round(factor) + round(offset)
     values = column.astype(np.float64) * factor + offset
-    sound = np.isfinite(values) & (np.abs(values) < -float(NEVER))
-    time = np.full(values.size, NEVER, np.int64)
+    sound = np.isfinite(values) & (np.abs(values) < -float(MISSING_TIME))
+    time = np.full(values.size, MISSING_TIME, np.int64)
     time[sound] = np.rint(values[sound]).astype(np.int64)
     return time
 
@@ -150,7 +151,7 @@ class Rhythm:
         number = np.maximum(np.rint(steps / self.interval).astype(np.int64) - 1, 0)
         late = np.flatnonzero(number)
         behind = (time - time[0]) - self.interval * np.arange(time.size)
-        window = np.arange(BEATS)
+        window = np.arange(BEAT_SAMPLES)
         before = np.median(behind[np.maximum(late[:, None] - window, 0)], axis=1)
         after = np.median(behind[np.minimum(late[:, None] + 1 + window, steps.size)], axis=1)
         lasting = np.rint((after - before) / self.interval).astype(np.int64)
@@ -222,7 +223,7 @@ def _parts(time: NDArray[Any], columns: Mapping[str, NDArray[Any]]) -> Parts:
     moved = steps[steps > 0]
     if not moved.size:
         return [(0, time.size)]
-    back = np.flatnonzero(np.diff(time) < -SET_BACK.value * np.median(moved)) + 1
+    back = np.flatnonzero(np.diff(time) < -MIN_RESTART_ROWS.value * np.median(moved)) + 1
     if back.size * 2 * _ROWS > time.size:  # shuffled, not restarted
         return [(0, time.size)]
     # Not a single row that came early or late: most rows that follow are earlier than those before
@@ -284,7 +285,7 @@ def without_leaps(
     """
     every = np.sort(np.concatenate(list(times.values())))
     steps = np.diff(every.view(np.uint64))  # the farthest two have no signed distance
-    last = np.flatnonzero(steps > CLOCK_LEAP.value * _SECOND)
+    last = np.flatnonzero(steps > MIN_CLOCK_LEAP_S.value * _SECOND)
     if not last.size:
         return dict(times), []
     leaps = steps[last]

@@ -49,11 +49,11 @@ class Layout:
 class Decoder:
     """Decoder of the wanted fields of a channel, by the first definition that fits a message."""
 
-    KEPT, FEW = 64, 2
-    """Largest number of stored layouts."""
-    TRIED = 200
+    MAX_LAYOUTS, MAX_LAYOUTS_VARIABLE = 64, 2
+    """Largest number of stored layouts, and of a topic whose layout changes all the time."""
+    MAX_FAILURES = 200
     """Undecodable messages in a row after which decoding stops."""
-    TOGETHER = 1024
+    BLOCK_MESSAGES = 1024
     """Messages compared with the layouts at once."""
 
     def __init__(
@@ -72,8 +72,8 @@ class Decoder:
     def decode(self, batch: Batch) -> list[Part]:
         """Decode a batch; skip and count the messages that cannot be decoded."""
         every = np.arange(len(batch))
-        begins = range(0, every.size, self.TOGETHER)
-        return [p for k in begins for p in self._decode(batch, every[k : k + self.TOGETHER])]
+        begins = range(0, every.size, self.BLOCK_MESSAGES)
+        return [p for k in begins for p in self._decode(batch, every[k : k + self.BLOCK_MESSAGES])]
 
     def _decode(self, batch: Batch, left: NDArray[np.int64]) -> list[Part]:
         """Decode some messages of a batch."""
@@ -87,9 +87,10 @@ class Decoder:
                     rest = batch.take(left)
                 if not left.size:
                     break
-            if left.size and not (self._failed < self.TRIED and self._learn(rest.message(0))):
+            may_learn = self._failed < self.MAX_FAILURES
+            if left.size and not (may_learn and self._learn(rest.message(0))):
                 self._failed += 1
-                others = left.size if self._failed > self.TRIED else 1
+                others = left.size if self._failed > self.MAX_FAILURES else 1
                 self.undecodable += others
                 left = left[others:]
         return parts
@@ -127,7 +128,8 @@ class Decoder:
         words = tuple((at, int.from_bytes(data[at : at + 4], "little")) for at in sorted(positions))
         self._layouts.insert(0, Layout(len(data), words, tuple(numbers)))
         self._learned, self._failed = self._learned + 1, 0
-        del self._layouts[self.KEPT if self._learned < 16 * self.KEPT else self.FEW :]
+        is_variable = self._learned >= 16 * self.MAX_LAYOUTS
+        del self._layouts[self.MAX_LAYOUTS_VARIABLE if is_variable else self.MAX_LAYOUTS :]
         return True
 
 

@@ -8,7 +8,11 @@ from scipy.signal import correlate
 from scipy.special import fdtrc, ndtri
 
 from smp_motor_control.arrays import Array, Integers
-from smp_motor_ident.bag.limits import BEHIND_GAIN, BEHIND_LEFT, EXPLAINS
+from smp_motor_ident.bag.limits import (
+    EXPLANATION_LEVEL,
+    MAX_LATE_COMMAND_RESIDUAL,
+    MAX_SHIFTED_RESIDUAL_RATIO,
+)
 from smp_motor_ident.quality.lag import lagged
 from smp_motor_ident.quality.limits import HALF_EXPLAINED
 
@@ -19,9 +23,9 @@ CLEAR_RATIO, SIMILAR_RATIO = (
     3.0,
 )  # ratio to the residual at other shifts: clearly smaller; similar
 FINE_SEARCH_ROWS = 20  # rows searched around a coarse estimate of the shift
-SECOND = (0.0, 0.5, 1.0, 2.0)  # rows of a second lag
+SECOND_LAG_ROWS = (0.0, 0.5, 1.0, 2.0)  # rows of a second lag
 MAX_FIT_ROWS = 5000  # rows used for a fit
-BLOCKS = 200  # averaged stretches of a motion, which reduce a counter's noise
+MOTION_BLOCKS = 200  # averaged stretches of a motion, which reduce a counter's noise
 
 
 def unexplained(u: Array, y: Array) -> float | None:
@@ -44,7 +48,7 @@ def unexplained(u: Array, y: Array) -> float | None:
         rests.append(float(np.sum((target - matrix @ solution) ** 2)) + 1e-12)
     free = target.size - OWN - LAGS - 1
     ratio = (rests[0] - rests[1]) / LAGS / (rests[1] / free)
-    return rests[1] / rests[0] if fdtrc(LAGS, free, ratio) < EXPLAINS.value else None
+    return rests[1] / rests[0] if fdtrc(LAGS, free, ratio) < EXPLANATION_LEVEL.value else None
 
 
 def answers_in_its_row(u: Array, y: Array) -> bool:
@@ -62,7 +66,7 @@ def answers_in_its_row(u: Array, y: Array) -> bool:
     size = steps[new + 1]
     at_once, later = float(size @ jumps[new]), float(size @ jumps[new + 1])
     scatter = float(np.nanstd(np.delete(jumps, new)) * np.linalg.norm(size))
-    return at_once > max(-float(ndtri(EXPLAINS.value)) * scatter, later)
+    return at_once > max(-float(ndtri(EXPLANATION_LEVEL.value)) * scatter, later)
 
 
 def follows(u: Array, y: Array) -> tuple[float, bool]:
@@ -111,7 +115,12 @@ def rows_behind(u: Array, y: Array) -> int:
             break
         best = least
     leading = min(left[shift] for shift in range(-3, 1))
-    return best if left[best] < min(BEHIND_LEFT.value, BEHIND_GAIN.value * leading) else 0
+    return (
+        best
+        if left[best]
+        < min(MAX_LATE_COMMAND_RESIDUAL.value, MAX_SHIFTED_RESIDUAL_RATIO.value * leading)
+        else 0
+    )
 
 
 def _explained_shares_by_shift(x: Array, y: Array, shifts: Integers) -> Array:
@@ -129,7 +138,7 @@ def _residual_share(u: Array, y: Array, shift: int, lag: float) -> float:
     u, y = (u[shift:], y[: y.size - shift]) if shift > 0 else (u[: u.size + shift], y[-shift:])
     every = max(y.size // MAX_FIT_ROWS, 1)
     best = np.inf
-    for trial, second in product(lag * np.geomspace(0.4, 2.5, 25), SECOND):
+    for trial, second in product(lag * np.geomspace(0.4, 2.5, 25), SECOND_LAG_ROWS):
         columns = (lagged(u, trial), lagged(np.sign(y), trial), np.ones(y.size))
         columns = (lagged(columns[0], second), *columns[1:])
         matrix = np.stack(columns, axis=1)[::every]
@@ -162,7 +171,7 @@ def _is_clock(column: Array) -> bool:
 
 def _explained_share(x: Array, y: Array) -> float:
     """Return the share of the second explained by a positive multiple of the first."""
-    every = max(y.size // BLOCKS, 1)
+    every = max(y.size // MOTION_BLOCKS, 1)
     x, y = (v[: v.size // every * every].reshape(-1, every).mean(axis=1) for v in (x, y))
     x, y = x - x.mean(), y - y.mean()
     both = float((x @ x) * (y @ y))

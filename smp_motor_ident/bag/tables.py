@@ -160,7 +160,7 @@ def apart(
                 continue
             of = tables[topic].columns[column]
             numbers, counts = np.unique(of[np.isfinite(of)], return_counts=True)
-            stray = limits.STRAY_ROWS.value * of.size
+            stray = limits.MAX_STRAY_ROW_SHARE.value * of.size
             numbers, counts = numbers[counts > stray], counts[counts > stray]
             if numbers.size < 2 or of.size - counts.sum() > stray:
                 continue
@@ -218,7 +218,7 @@ def timed(recording: Recording, plan: MotorMap, tables: Mapping[str, Table]) -> 
                 if unit and unit != signal.unit:
                     text = f"{recording.name}: {signal.field} is taken for {unit} since 1970"
                     findings.append(found("time_unit", text))
-        sound = log > clock.NEVER
+        sound = log > clock.MISSING_TIME
         columns = table.columns
         if not sound.all():
             text = f"{recording.name}: {int((~sound).sum())} rows without time were left out"
@@ -238,9 +238,9 @@ def timed(recording: Recording, plan: MotorMap, tables: Mapping[str, Table]) -> 
 
 def _check_seconds(log: Integers, signal: Signal, recording: Recording) -> None:
     """Refuse a time without unit whose rows are too far apart for seconds."""
-    steps = np.diff(log[log > clock.NEVER]) * 1e-9
+    steps = np.diff(log[log > clock.MISSING_TIME]) * 1e-9
     step = float(np.median(steps)) if steps.size else 0.0
-    if step >= limits.SECONDS_APART.value:
+    if step >= limits.MAX_ROW_INTERVAL_S.value:
         raise BagError(
             f"{recording.files[0]}: {signal.field} rises by {step:g} per row, too fast; "
             f"tell its unit: time={signal.field}:ms (or us, ns; s where it is seconds)"

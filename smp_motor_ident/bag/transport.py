@@ -20,7 +20,7 @@ from smp_motor_ident.errors import BagError
 COMMAND = "smp_interfaces/msg/MotorCommand"
 
 MIN_COMMANDS = 50  # smallest number of commands for quantiles of the delay
-SHARE = 0.95
+DELAY_QUANTILE = 0.95
 """Share of the commands covered by the longest delay: margins concern lasting delays, a single late
 command is a disturbance."""
 
@@ -83,9 +83,9 @@ def _delay(state: Table, command: Table) -> TransportDelay | None:
     stamp, log = command.stamp[answers], command.logged[answers]
     offset = clock.fit_clock(state.stamp, state.logged)
     # With different clocks, the fastest state defines zero latency.
-    one_clock = abs(offset.offset) < clock.SAME_CLOCK
+    one_clock = abs(offset.offset) < clock.MAX_CLOCK_OFFSET_NS
     arrival = 1e-9 * (log - (stamp if one_clock else offset.to_log(stamp)))
-    usual, longest = (float(q) for q in np.quantile(arrival, (0.5, SHARE)))
+    usual, longest = (float(q) for q in np.quantile(arrival, (0.5, DELAY_QUANTILE)))
     period = 1e-9 * float(np.median(np.diff(np.sort(state.stamp))))
     applied = _until_applied(state, stamp, command.columns["voltage"][answers], period)
     latched = applied is not None and applied > usual + 0.25 * period

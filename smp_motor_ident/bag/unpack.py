@@ -20,7 +20,7 @@ import lz4.frame
 import numpy as np
 from backports import zstd  # from Python 3.14 on: compression.zstd
 
-from smp_motor_ident.bag.limits import UNPACKED_LEAST, UNPACKED_RATIO
+from smp_motor_ident.bag.limits import MAX_UNPACKING_RATIO, MIN_UNPACKED_LIMIT
 from smp_motor_ident.bag.storage import Batch, gather, join
 from smp_motor_ident.errors import BagError
 
@@ -42,7 +42,7 @@ class Budget:
     def __init__(self, name: str, packed: int) -> None:
         self.name = name
         self.limit = _read_user_limit() or int(
-            max(UNPACKED_LEAST.value, UNPACKED_RATIO.value * packed)
+            max(MIN_UNPACKED_LIMIT.value, MAX_UNPACKING_RATIO.value * packed)
         )
         self.left = self.limit
 

@@ -13,7 +13,7 @@ from smp_motor_ident.bag.read import OWN_FIELDS
 from smp_motor_ident.bag.storage import Table
 from smp_motor_ident.record import Hardware, Record
 
-CAPACITY = 200_000  # largest number of samples
+MAX_SAMPLES = 200_000  # largest number of samples
 MIN_SAMPLES = 10  # samples below which there is no record
 
 
@@ -24,7 +24,7 @@ class Window:
         self.wheel = wheel
         self.hardware = Hardware()
         self._length = round(1e9 * length)
-        self._rows: deque[tuple[Any, ...]] = deque(maxlen=CAPACITY)
+        self._rows: deque[tuple[Any, ...]] = deque(maxlen=MAX_SAMPLES)
 
     def __len__(self) -> int:
         """Return the number of samples held."""

@@ -17,12 +17,12 @@ from typing import IO, Any, cast
 import yaml
 from mcap.writer import CompressionType, Writer
 
-from smp_motor_ident.bag.readers.mcap import NUMBERED
+from smp_motor_ident.bag.readers.mcap import SEQUENCE_KEY
 from smp_motor_ident.bag.types import definition
 from smp_motor_ident.errors import BagError
 
 FLUSH_PERIOD = 0.5
-SHARE = 0.05
+MAX_FLUSH_SHARE = 0.05
 """Largest share of the time for flushing; longer files are flushed less often."""
 
 _FOREVER = {"sec": 9223372036, "nsec": 854775807}
@@ -150,7 +150,7 @@ class BagWriter:
             described = {
                 "offered_qos_profiles": _dumped(profiles),
                 "topic_type_hash": type_hash,
-                **({NUMBERED: "true"} if numbered else {}),
+                **({SEQUENCE_KEY: "true"} if numbered else {}),
             }
             channel = self._mcap.register_channel(topic, "cdr", schema, described)
             metadata = {
@@ -228,7 +228,7 @@ class BagWriter:
             except OSError as error:
                 raise BagError(f"{self.path}: cannot be written ({error.strerror})") from None
             self._flushed = time.monotonic()
-            self._period = max(self._flush_period, (self._flushed - begun) / SHARE)
+            self._period = max(self._flush_period, (self._flushed - begun) / MAX_FLUSH_SHARE)
 
     def _write_all(self, data: bytes, position: int) -> None:
         view = memoryview(data)

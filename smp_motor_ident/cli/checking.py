@@ -16,14 +16,14 @@ from smp_motor_ident.finding import Finding
 from smp_motor_ident.record import Hardware
 
 REST, COAST = 0.3, 0.4  # zero voltage before and after [s]; a coast of a few time constants
-LONGEST_HOLD = 2.0  # a voltage is held for so long where the wheel is slow [s]
-RAMP = 0.15  # growth of the voltage until the wheel turns [of the supply per second]
-GROWTH = 2.0  # of the voltage from one level to the next
-FIRST = (1.5, 0.05)
+MAX_HOLD_S = 2.0  # a voltage is held for so long where the wheel is slow [s]
+RAMP_RATE = 0.15  # growth of the voltage until the wheel turns [of the supply per second]
+LEVEL_RATIO = 2.0  # of the voltage from one level to the next
+FIRST_LEVEL = (1.5, 0.05)
 """First level: multiple of the starting voltage, plus a share of the supply."""
 
 TIMEOUT_S = 5.0  # longest wait for descriptions [s]
-TURNED = 12.0  # counts after which a ramp ends: the wheel turns
+TURNED_COUNTS = 12.0  # counts after which a ramp ends: the wheel turns
 
 
 @dataclass(frozen=True)
@@ -56,22 +56,22 @@ class _Way:
     def test_direction(self, sign: float) -> None:
         """Ramp until it turns, then hold growing levels until it answers well, then coast."""
         tape = self.test.tapes[self.wheel]
-        rate, first = RAMP * self.supply, len(tape.rows)
+        rate, first = RAMP_RATE * self.supply, len(tape.rows)
         start = self.phase(
             "ramp",
             lambda t: sign * min(rate * t, self.limit),
             self.limit / rate,
-            lambda: tape.turned(first) >= TURNED,
+            lambda: tape.turned(first) >= TURNED_COUNTS,
         )
         # Two levels at least tell friction from gain.
-        level = FIRST[0] * abs(start) + FIRST[1] * self.supply
+        level = FIRST_LEVEL[0] * abs(start) + FIRST_LEVEL[1] * self.supply
         level = min(level, 0.5 * (abs(start) + self.limit))
-        while tape.turned(first) >= TURNED:
+        while tape.turned(first) >= TURNED_COUNTS:
             before = len(tape.rows)
-            self.phase("hold", _constant(sign * level), LONGEST_HOLD, self._steady(before))
+            self.phase("hold", _constant(sign * level), MAX_HOLD_S, self._steady(before))
             if level >= self.limit or answers_well(level, abs(start), tape.turned(before)):
                 break
-            level = min(GROWTH * level, self.limit)
+            level = min(LEVEL_RATIO * level, self.limit)
         self.phase("coast", lambda t: 0.0, COAST, None)
 
     def _steady(self, since: int) -> Callable[[], bool]:

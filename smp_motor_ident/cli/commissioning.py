@@ -32,7 +32,7 @@ AMPLITUDE, DURATION = 6.0, 15.0
 """Largest voltage [V] and length of a signal [s], unless the user or an earlier run says so."""
 
 DRAFT = "recording"  # folder of a recording until it is whole
-ANSWER = 2.0  # a controller that runs is discovered by then [s]
+DISCOVERY_S = 2.0  # a controller that runs is discovered by then [s]
 LOOKS, ALIKE = 15, 4
 """Largest number of searches for wheels [1 s each], and equal results in a row that end them."""
 
@@ -139,7 +139,7 @@ def _begin(arguments: argparse.Namespace, robot: steps.Robot) -> Session | None:
 
 def _tell_controllers(arguments: argparse.Namespace, robot: steps.Robot) -> None:
     """Report wheels without a controller, for which one is started for the drive."""
-    robot.client.until(lambda: not robot.uncontrolled(), ANSWER)
+    robot.client.until(lambda: not robot.uncontrolled(), DISCOVERY_S)
     missing = ", ".join(robot.uncontrolled())
     if missing and arguments.apply:
         raise ParameterError(
@@ -190,7 +190,7 @@ def _record(session: Session, one: plan.Recording) -> None:
     robot.client.refuse_second_reporters(robot.wheels)
     speed = session.protocol.document.get("speed")
     if speed and not arguments.max_speed:
-        fastest = wheel_limits.OVER_SPEED.value * float(speed)
+        fastest = wheel_limits.MAX_SPEED_RATIO.value * float(speed)
         robot = replace(robot, bounds={**robot.bounds, "max_speed": fastest})
     session.begin(one.part, one.describe())
     draft = robot.folder / DRAFT

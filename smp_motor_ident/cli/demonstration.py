@@ -33,11 +33,11 @@ DRIVE = (
 )
 """Manoeuvres: name, m/s, rad/s, s."""
 
-STALL = 0.008
+MAX_STALL_S = 0.008
 """Pause of the computer [s] after which a drive is repeated; the least disturbed drive is shown,
 and judged only if the machine kept pace."""
 
-ATTEMPTS = 3
+MAX_ATTEMPTS = 3
 
 
 def work(arguments: argparse.Namespace) -> int:
@@ -67,7 +67,7 @@ def work(arguments: argparse.Namespace) -> int:
     }
     verdict.show(truth, designed, changes)
     checks = verdict.check_estimates(truth, designed.estimates)
-    if stall <= STALL:
+    if stall <= MAX_STALL_S:
         checks += verdict.check_drive(changes)
     else:
         print(f"---- the drive is not judged: this machine stood still for {1e3 * stall:.0f} ms")
@@ -128,7 +128,7 @@ def drive(
     lasts = plan.words(sum(seconds for *_, seconds in DRIVE))
     say(f"gains set in the running controllers; driving for {lasts}")
     drives = []
-    for attempt in range(1, ATTEMPTS + 1):
+    for attempt in range(1, MAX_ATTEMPTS + 1):
         name = "drive" if attempt == 1 else f"drive_{attempt}"
         bag = steps.record(robot, name, "motor_command", "pid_state")
         segments = drive_body(robot.client, DRIVE, robot.wheels)
@@ -136,7 +136,7 @@ def drive(
         read = driving.read_drive(bag, robot.wheels)
         stall = driving.longest_stall(read)
         drives.append((stall, name, read, segments))
-        if stall <= STALL:
+        if stall <= MAX_STALL_S:
             break
         say(f"this machine stood still for {1e3 * stall:.0f} ms during drive {attempt}")
     robot.switch("deactivate")

@@ -24,7 +24,7 @@ from smp_motor_ident.tune import verification
 from smp_motor_ident.tune.verification import Change
 
 MIN_CHANGE = 0.8  # a smaller change of the set-point [rad/s, wheel] is no step to judge
-LEAD = 0.3  # rest before a drive that is simulated with it [s]
+LEAD_S = 0.3  # rest before a drive that is simulated with it [s]
 MAX_SAMPLES = 1e6  # of a drive, which takes seconds
 STATE = ("encoder_count", "position", "voltage")
 ANSWER = ("setpoint", "age", "dt", "output")
@@ -112,7 +112,7 @@ def changes_of(
     if not moves:
         return [], silence
     end = max(one.begin + one.lasts for one in moves)
-    shown = (state.seconds > answers.seconds[0] - LEAD) & (state.seconds < end)
+    shown = (state.seconds > answers.seconds[0] - LEAD_S) & (state.seconds < end)
     instants = state.seconds[shown]
     known = dict(zip(answers.seconds, delays))
     waited = np.array([known.get(instant, np.nan) for instant in instants])

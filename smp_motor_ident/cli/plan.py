@@ -10,7 +10,7 @@ import numpy as np
 
 from smp_motor_control.excitation import SIGNALS as SHAPES
 from smp_motor_ident.cli.steps import Excitation
-from smp_motor_ident.commission.wheel_limits import WANTED_ACCURACY
+from smp_motor_ident.commission.wheel_limits import REQUIRED_ACCURACY
 from smp_motor_ident.infer.planning import what_next
 from smp_motor_ident.result import Estimate
 
@@ -30,12 +30,12 @@ FURTHER = "further"  # name of the recording that an identification asks for
 IDENTIFYING, AGAIN, TUNING = "identifying", "identifying again", "tuning"
 DRIVING = "driving on the new gains"
 
-LONGEST = 120.0  # of such a recording [s]
+MAX_FURTHER_S = 120.0  # of such a recording [s]
 CHECK, START, COMPUTE, DRIVE = 8.0, 4.0, 4.0, 12.0
 """First guesses [s]: the test of one wheel, the start and end of processes around a signal, the
 identification or tuning of one wheel, the drive."""
 
-PAGE = 2  # times an identification that its tuning page takes
+PAGE_COST = 2  # times an identification that its tuning page takes
 DRAWN, COLUMNS, BLOCKS = 4.0, 72, "▁▂▃▄▅▆▇█"
 """So many seconds of a signal are drawn, on so many columns, with these levels."""
 
@@ -78,7 +78,8 @@ def further(estimates: Mapping[str, Estimate], amplitude: float) -> Recording | 
     if not wanting:
         return None
     proposals = [
-        what_next(one, WANTED_ACCURACY.value, supply=amplitude, longest=LONGEST) for one in wanting
+        what_next(one, REQUIRED_ACCURACY.value, supply=amplitude, longest=MAX_FURTHER_S)
+        for one in wanting
     ]
     longest = max(proposals, key=lambda one: one.duration)
     signal = Excitation("fourier", longest.duration, longest.amplitude, longest.band)
@@ -92,7 +93,7 @@ def _open(estimate: Estimate) -> list[str]:
         for name in ("dc_gain", "time_constant", "resistance", "motor_constant", "inertia")
         if (one := known.get(name)) is not None
         and one.value
-        and (one.std or 0.0) > WANTED_ACCURACY.value * abs(one.value)
+        and (one.std or 0.0) > REQUIRED_ACCURACY.value * abs(one.value)
     ]
 
 
@@ -170,7 +171,7 @@ def schedule(
     for part in parts:
         made.add(part.part, "signal", part.excitation.duration + START)
     if not identified:
-        pages = 1 + PAGE * tuning_page
+        pages = 1 + PAGE_COST * tuning_page
         made.add(IDENTIFYING, "identify", pages * COMPUTE * len(wheels))
     if not tuned:
         made.add(TUNING, "tune", COMPUTE * len(wheels))
@@ -205,10 +206,11 @@ def drawn(amplitude: float, duration: float, wheels: Sequence[str]) -> list[str]
         lines.append(f"  {bars}")
         begin += part.duration
     total = words(schedule(wheels, parts).left())
-    accuracy = 100 * WANTED_ACCURACY.value
+    accuracy = 100 * REQUIRED_ACCURACY.value
     lines += [
         f"then: identify; where a number is not known to {accuracy:g} %, one more Fourier signal "
-        f"of at most {LONGEST:g} s; tune; a drive of some {DRIVE:g} s with the gains on trial",
+        f"of at most {MAX_FURTHER_S:g} s; tune; a drive of some {DRIVE:g} s with the gains on "
+        "trial",
         f"{begin:g} s of excitation, about {total} in all for {len(wheels)} wheels. "
         "Nothing was moved.",
     ]

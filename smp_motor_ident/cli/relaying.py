@@ -17,8 +17,10 @@ from smp_motor_ident.report.document import check_free, write_together
 from smp_motor_ident.tune.methods.relay import read_oscillation
 from smp_motor_ident.tune.methods.ziegler_nichols import by_rule
 
-BIAS = 0.4  # share of the supply around which the relay switches, so that friction is not crossed
-GAP = 0.25  # share of a cycle without a sample over which a record is not read
+BIAS_SHARE = 0.4
+"""Share of the supply around which the relay switches, so that friction is not crossed."""
+MAX_GAP_SHARE = 0.25
+"""Share of a cycle without a sample from which a recording is split."""
 SIGNALS = ("time", "voltage", "applied", "speed", "angle")
 
 
@@ -28,7 +30,7 @@ def tune_by_relay(arguments: argparse.Namespace, files: Sequence[Path]) -> int:
     if supply is None or not 0 < supply < math.inf:
         raise ParameterError("--relay needs the supply voltage; give --supply")
     amplitude = 0.25 * supply if arguments.relay_amplitude is None else arguments.relay_amplitude
-    bias = BIAS * supply
+    bias = BIAS_SHARE * supply
     if not 0 < amplitude <= supply - bias:
         raise ParameterError(
             f"--relay-amplitude is {amplitude:g} V; it must be within {supply - bias:g} V around "
@@ -75,7 +77,7 @@ def evenly(answer: Mapping[str, Any]) -> tuple[list[tuple[Array, Array]], float]
     step = float(np.median(np.diff(time)))
     rising = np.flatnonzero(np.diff(np.sign(answer["voltage"])) > 0)
     cycle = float(np.median(np.diff(time[rising]))) if rising.size > 1 else np.inf
-    cuts = np.flatnonzero(np.diff(time) > max(GAP * cycle, 3 * step)) + 1
+    cuts = np.flatnonzero(np.diff(time) > max(MAX_GAP_SHARE * cycle, 3 * step)) + 1
     parts = [np.split(np.array(answer[name]), cuts) for name in SIGNALS]
     return [_even(step, *part) for part in zip(*parts, strict=True) if part[0].size > 2], step
 

@@ -16,7 +16,7 @@ from smp_motor_ident.report import summary, words
 from smp_motor_ident.result import Estimate
 
 MAX_FIELDS = 12  # largest number of printed fields per topic
-WIDE = 110  # columns of a terminal that has room for 95 % intervals
+WIDE_COLUMNS = 110  # columns of a terminal that has room for 95 % intervals
 _COLOR = {"good": "green", "fair": "yellow", "poor": "red"}
 
 
@@ -40,7 +40,7 @@ def print_estimate(out: Console, estimate: Estimate, verbose: bool = False) -> N
     title = f"{words.label(estimate.wheel)}: {words.model(estimate.model)}"
     out.print(title, style="bold", soft_wrap=True)
     out.print(Text(f"{verdict}.", style=_COLOR[grade]), summary.describe_fit(estimate))
-    out.print(_values(estimate, intervals=out.width >= WIDE))
+    out.print(_values(estimate, intervals=out.width >= WIDE_COLUMNS))
     shown, other = summary.select_messages(estimate)
     for one in (*shown, *other) if verbose else shown:
         text = f"{one.number}. {one.severity.capitalize()}: {one.text} {one.advice}".rstrip()

@@ -13,13 +13,13 @@ import numpy as np
 from smp_motor_control import controller_of
 from smp_motor_ident.bag.storage import Table
 from smp_motor_ident.cli import processes, steps
-from smp_motor_ident.cli.driving import LEAD, Designed, Move, changes_of, read_drive
+from smp_motor_ident.cli.driving import LEAD_S, Designed, Move, changes_of, read_drive
 from smp_motor_ident.finding import Finding
 from smp_motor_ident.tune import verification
-from smp_motor_ident.tune.verification import STEADY, Change
+from smp_motor_ident.tune.verification import STEADY_TIME_S, Change
 
-LEAST = 1.0  # of a change of set-point with its end [s]
-ATTEMPTS = 3  # largest number of drives; a disturbed drive is repeated
+MIN_STEP_S = 1.0  # of a change of set-point with its end [s]
+MAX_ATTEMPTS = 3  # largest number of drives; a disturbed drive is repeated
 
 
 class NeverHeard(processes.ProcessError):
@@ -53,10 +53,10 @@ def plan_of(designed: Designed) -> list[tuple[str, float, float]]:
     """Return the steps of the drive: name, set-point [rad/s] and duration [s]."""
     specified = [one["specification"] for one in designed.document.values()]
     change = min(float(one["change"]) for one in specified)
-    longest = max(float(one["settling"]["high"] or LEAST) for one in specified)
-    lasts = max(LEAST, 2 * longest + STEADY)
+    longest = max(float(one["settling"]["high"] or MIN_STEP_S) for one in specified)
+    lasts = max(MIN_STEP_S, 2 * longest + STEADY_TIME_S)
     driven = [("forward", change), ("stop", 0.0), ("reverse", -change), ("stop", 0.0)]
-    return [("stand", 0.0, 2 * LEAD), *((name, speed, lasts) for name, speed in driven)]
+    return [("stand", 0.0, 2 * LEAD_S), *((name, speed, lasts) for name, speed in driven)]
 
 
 def drive(robot: steps.Robot, plan: Sequence[tuple[str, float, float]]) -> Path:
@@ -80,7 +80,7 @@ def drive_undisturbed(
 ) -> tuple[list[Change], list[Finding]]:
     """Repeat a drive until it is undisturbed; return the changes and the findings."""
     plan, namespace = plan_of(designed), str(robot.client.node.get_namespace()).rstrip("/")
-    for left in reversed(range(ATTEMPTS)):
+    for left in reversed(range(MAX_ATTEMPTS)):
         say(f"driving on the new gains: {', '.join(name for name, *_ in plan)}")
         try:
             changes, silence = read_changes(drive(robot, plan), plan, designed, namespace)

@@ -9,7 +9,7 @@ import numpy as np
 from scipy import stats
 
 from smp_motor_control.arrays import Array
-from smp_motor_ident.commission.wheel_limits import VALIDATION_LEVEL, VALIDATION_SHARE
+from smp_motor_ident.commission.wheel_limits import VALIDATION_LEVEL, VALIDATION_TOLERANCE
 from smp_motor_ident.finding import Finding
 
 BLOCK = 0.5
@@ -58,7 +58,7 @@ def judge(wheel: str, fitted: Sequence[Simulated], held_out: Sequence[Simulated]
         "variance_ratio": ratio,
         "limit": limit,
     }
-    if ratio > limit and share > VALIDATION_SHARE.value:
+    if ratio > limit and share > VALIDATION_TOLERANCE.value:
         return Finding(
             "validation_run",
             "refused",

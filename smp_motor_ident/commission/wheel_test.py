@@ -12,14 +12,14 @@ from numpy.typing import ArrayLike
 
 from smp_motor_control.arrays import Array, Flags
 from smp_motor_ident.commission.wheel_limits import (
-    ANSWER_COUNTS,
     BREAKAWAY_COUNTS,
-    FRICTION_SHARE,
-    SUPPLY_SHORTFALL,
+    MAX_FRICTION_SHARE,
+    MAX_SUPPLY_SHORTFALL,
+    MIN_RESPONSE_COUNTS,
 )
 from smp_motor_ident.record import Hardware
 
-HOLD = 0.4
+MIN_HOLD_S = 0.4
 """Shortest time for which a voltage is held [s]."""
 
 ENCODER_DITHER = 1.0
@@ -91,7 +91,7 @@ class Figures:
 
 def answers_well(level: float, breakaway: float, counts: float) -> bool:
     """Tell whether a wheel's response depends more on the motor than on friction."""
-    return level * FRICTION_SHARE.value >= breakaway and counts >= ANSWER_COUNTS.value
+    return level * MAX_FRICTION_SHARE.value >= breakaway and counts >= MIN_RESPONSE_COUNTS.value
 
 
 def settled(hold: Trace) -> bool:
@@ -102,7 +102,7 @@ def settled(hold: Trace) -> bool:
     there = _held(hold)
     time, count = there.time, there.count
     span = float(np.ptp(time)) if time.size > 8 else 0.0
-    if span < HOLD or not _arrived(there):
+    if span < MIN_HOLD_S or not _arrived(there):
         return False
     thirds = np.interp(time[0] + span * np.arange(1, 4) / 3, time, count)
     before, last = np.abs(np.diff(thirds))
@@ -121,7 +121,7 @@ def _held(hold: Trace) -> Trace:
 def _arrived(held: Trace) -> bool:
     """Tell whether the reported voltage equals the command within the tolerance of the supply."""
     command, voltage = (float(np.median(x[-8:])) for x in (held.command, held.voltage))
-    return abs(voltage - command) <= SUPPLY_SHORTFALL.value * abs(command)
+    return abs(voltage - command) <= MAX_SUPPLY_SHORTFALL.value * abs(command)
 
 
 def figures(trace: Trace, phases: Sequence[Phase], hardware: Hardware) -> Figures:
@@ -217,7 +217,7 @@ def _coast(hold: Trace, coast: Trace, hardware: Hardware) -> float:
     steady, free = _Steady.of(hold, hardware), _held(coast)
     if not steady.speed or free.time.size < 2:
         return math.nan
-    if abs(float(np.median(free.voltage[-8:]))) > SUPPLY_SHORTFALL.value * abs(steady.voltage):
+    if abs(float(np.median(free.voltage[-8:]))) > MAX_SUPPLY_SHORTFALL.value * abs(steady.voltage):
         return math.nan  # a busy computer did not let go of it yet
     angle = free.count * _angle_per_count(hardware)
     return float((angle[-1] - angle[0]) / steady.speed)

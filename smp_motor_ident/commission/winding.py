@@ -22,16 +22,16 @@ from typing import NamedTuple
 
 import numpy as np
 
-from smp_motor_ident.commission.wheel_limits import WINDING_RISE
+from smp_motor_ident.commission.wheel_limits import MAX_RESISTANCE_RISE
 from smp_motor_ident.finding import Finding
-from smp_motor_ident.live.monitor import BLOCK, COPPER
+from smp_motor_ident.live.monitor import BLOCK_S, COPPER_COEFFICIENT
 from smp_motor_ident.record import Record
 
-SURE = 3.0
+MIN_DEVIATIONS = 3.0
 """Required excess over the limit [standard deviations]."""
 
 
-SEPARABLE = 1e6
+MAX_CONDITION = 1e6
 """Condition number beyond which the columns of a recording are collinear."""
 
 
@@ -50,7 +50,7 @@ def resistance(record: Record) -> Resistance | None:
     dt = np.diff(record.time)
     current, voltage = record.current, record.voltage
     turned = np.diff(np.asarray(motion, dtype=np.float64))
-    block = (record.time[1:] / BLOCK).astype(np.int64) * len(record.starts)
+    block = (record.time[1:] / BLOCK_S).astype(np.int64) * len(record.starts)
     block += np.searchsorted(record.starts, np.arange(1, len(record)), side="right")
     speeding = np.diff(turned / dt, prepend=0.0)
     changes = np.diff(current), np.diff(voltage)
@@ -58,7 +58,7 @@ def resistance(record: Record) -> Resistance | None:
     good = np.isfinite(rows).all(axis=0)
     good[np.asarray(record.starts[1:], dtype=np.int64) - 1] = False
     sums = np.stack([np.bincount(block[good], weights=row[good]) for row in rows])
-    moves = (sums[5] > 0.5 * BLOCK) & (sums[2] != 0.0)
+    moves = (sums[5] > 0.5 * BLOCK_S) & (sums[2] != 0.0)
     volts, amps, angle, surge, step, spent, run_up = sums[:, moves]
     table = np.stack([amps, angle, surge, step, spent])
     known = np.stack([volts, angle, run_up, step, spent])  # free of the current's noise
@@ -67,7 +67,7 @@ def resistance(record: Record) -> Resistance | None:
     if spare < len(table) or not (sizes > 0).all() or not (tools > 0).all():
         return None
     normal = (known / tools[:, None]) @ (table / sizes[:, None]).T
-    if np.linalg.cond(normal) > SEPARABLE:
+    if np.linalg.cond(normal) > MAX_CONDITION:
         return None
     inverse = np.linalg.inv(normal) / sizes[:, None]
     solved = inverse @ (known / tools[:, None] @ volts)
@@ -89,9 +89,9 @@ def heated(wheel: str, earlier: Sequence[Record], last: Record) -> list[Finding]
     cold = min(known, key=lambda r: r.std / r.value)
     rise = now.value / cold.value - 1.0
     std = math.hypot((1.0 + rise) * cold.std, now.std) / cold.value
-    if rise - SURE * std <= WINDING_RISE.value:
+    if rise - MIN_DEVIATIONS * std <= MAX_RESISTANCE_RISE.value:
         return []
-    warmer = rise / COPPER
+    warmer = rise / COPPER_COEFFICIENT
     return [Finding(
         "winding_hot", "refused",
         f"{wheel}: its resistance rose by {100 * rise:.0f} % from signal to signal: the winding "

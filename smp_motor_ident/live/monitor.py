@@ -31,23 +31,23 @@ from smp_motor_ident.result import Estimate
 
 Validity = Literal["unestimated", "estimated", "invalid"]
 
-BLOCK = 0.25
+BLOCK_S = 0.25
 """Length of a block [s]: shorter ones amplify the current's noise, longer ones blur changes."""
 
-GAP = 5.0
+MAX_GAP_INTERVALS = 5.0
 """Number of usual intervals without a sample after which the motion between is unknown."""
 
-WALK = {"resistance": 5e-3, "motor_constant": 5e-4, "friction": 0.05}
+RANDOM_WALK_STD = {"resistance": 5e-3, "motor_constant": 5e-4, "friction": 0.05}
 """Standard deviation of a second's random walk, relative: a winding that heats by a per cent in
 three seconds is followed within some ten."""
 
-PRIOR = {"resistance": 0.3, "motor_constant": 0.1, "inductance": 0.01, "friction": 1.0}
+PRIOR_STD = {"resistance": 0.3, "motor_constant": 0.1, "inductance": 0.01, "friction": 1.0}
 """Relative standard deviations of the prior; iron, and so the inductance, hardly changes."""
 
 MAX_DEVIATIONS = 4.0
 """Standard deviations beyond which a block is left out: a bad sample, a blow."""
 
-COPPER = 0.00393
+COPPER_COEFFICIENT = 0.00393
 """Temperature coefficient of copper's resistance [1/K]."""
 
 
@@ -140,17 +140,21 @@ class Monitor:
     def __init__(self, commissioned: Commissioned) -> None:
         self.commissioned = c = commissioned
         start = np.array([c.resistance, c.motor_constant, c.inductance, 0.0])
-        size = np.array([PRIOR["resistance"], PRIOR["motor_constant"], PRIOR["inductance"], 0.0])
-        pace = np.array([WALK["resistance"], WALK["motor_constant"], 0.0, 0.0])
+        size = np.array(
+            [PRIOR_STD["resistance"], PRIOR_STD["motor_constant"], PRIOR_STD["inductance"], 0.0]
+        )
+        pace = np.array(
+            [RANDOM_WALK_STD["resistance"], RANDOM_WALK_STD["motor_constant"], 0.0, 0.0]
+        )
         offset = np.array([0.0, 0.0, 0.0, 0.02 * c.supply_voltage])
-        noise = (0.02 * c.supply_voltage * BLOCK) ** 2
+        noise = (0.02 * c.supply_voltage * BLOCK_S) ** 2
         self._electrical = _Filter(
             start, pace * start + 0.01 * offset, size * start + offset, noise
         )
-        torque = (0.5 * c.coulomb_friction + 1e-3 * c.motor_constant) * BLOCK
+        torque = (0.5 * c.coulomb_friction + 1e-3 * c.motor_constant) * BLOCK_S
         self._friction = {
-            way: _Filter(np.ones(1), np.array([WALK["friction"]]),
-                         np.array([PRIOR["friction"]]), torque**2)
+            way: _Filter(np.ones(1), np.array([RANDOM_WALK_STD["friction"]]),
+                         np.array([PRIOR_STD["friction"]]), torque**2)
             for way in (1, -1)
         }  # fmt: skip
         self._block = _Block()
@@ -170,7 +174,7 @@ class Monitor:
             self._block = _Block()
             return
         dt = 0.0 if before is None else time - before[0]
-        usable = before is not None and 0 < dt <= GAP * (self._usual or dt)
+        usable = before is not None and 0 < dt <= MAX_GAP_INTERVALS * (self._usual or dt)
         if dt > 0:
             self._usual += (0.01 if self._usual else 1.0) * (
                 min(dt, 2 * (self._usual or dt)) - self._usual
@@ -188,7 +192,7 @@ class Monitor:
         block.amps += 0.5 * (current + before[1]) * dt
         block.turned += turned
         block.directions.add((turned > 0) - (turned < 0))
-        if block.time >= BLOCK:
+        if block.time >= BLOCK_S:
             self._close(block, current, speed)
             self._block = _Block()
 
@@ -230,7 +234,7 @@ class Monitor:
     def validity(self) -> dict[str, tuple[Validity, str]]:
         """Return by name whether a value is known, or the reason if not."""
         out: dict[str, tuple[Validity, str]] = {}
-        scale = 0.1 * self.commissioned.supply_voltage * BLOCK
+        scale = 0.1 * self.commissioned.supply_voltage * BLOCK_S
         contradicts = self._electrical.noise > scale**2
         for name, (_, std, band) in self._shares().items():
             if contradicts:
@@ -265,7 +269,7 @@ def _finding(name: str, share: float, out: Mapping[str, float]) -> Finding:
     evidence: dict[str, float | str | None] = {"change": share}
     change = f"{100 * abs(share):.0f} % {'above' if share > 0 else 'below'} its commissioned value"
     if name == "resistance" and share > 0:
-        warmer = share / COPPER
+        warmer = share / COPPER_COEFFICIENT
         return Finding(
             "winding_hot", "warning",
             f"resistance is {change}: the winding is {warmer:.0f} K warmer, or brushes wear",

@@ -48,7 +48,7 @@ QUEUE_DEPTH = QoSProfile(depth=1000, reliability=ReliabilityPolicy.BEST_EFFORT)
 TAKE_PERIOD = 0.05
 """Between two batches of samples [s]: waking up for each would cost half as much again."""
 
-MINUTE = 60.0  # between two lines of a history [s]
+HISTORY_PERIOD_S = 60.0  # between two lines of a history [s]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -175,7 +175,7 @@ class Identifier(Node):
         runtime.steady_timer(self, settings.period, self._begin)
         runtime.steady_timer(self, 0.1, self._publish_finished)
         if settings.history:
-            runtime.steady_timer(self, MINUTE, self._add_history)
+            runtime.steady_timer(self, HISTORY_PERIOD_S, self._add_history)
 
     def _take_all(self) -> None:
         for wheel in self._wheels.values():

@@ -21,9 +21,9 @@ from smp_motor_ident.errors import BagError, ParameterError
 from smp_motor_ident.result import Estimate, Quantity
 
 SCHEMA = 1
-LARGEST = 1e12
+MAX_VALUE = 1e12
 """No number of a motor is larger in SI units; squares of larger ones leave the floats."""
-POSITIVE = ("resistance", "inductance", "motor_constant", "inertia", "dc_gain")
+POSITIVE_QUANTITIES = ("resistance", "inductance", "motor_constant", "inertia", "dc_gain")
 
 
 def now() -> str:
@@ -117,11 +117,11 @@ def _check(estimate: Estimate) -> None:
     if size and (np.diag(estimate.covariance) < 0).any():
         raise ValueError("a variance is negative")
     for name, quantity in (*estimate.parameters.items(), *estimate.combinations.items()):
-        if abs(quantity.value or 0.0) > LARGEST:
+        if abs(quantity.value or 0.0) > MAX_VALUE:
             raise ValueError(f"{name} is {quantity.value:g}; no motor has that")
         if quantity.value is None and quantity.status != "unidentifiable":
             raise ValueError(f"{name}: it is {quantity.status} and has no value")
-        if name in POSITIVE and quantity.value is not None and quantity.value <= 0:
+        if name in POSITIVE_QUANTITIES and quantity.value is not None and quantity.value <= 0:
             raise ValueError(f"{name} is {quantity.value}; it must be positive")
 
 

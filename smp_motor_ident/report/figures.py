@@ -12,12 +12,12 @@ from smp_motor_ident.report.chart import Chart, Curve, thin
 from smp_motor_ident.report.words import label
 from smp_motor_ident.result import ResidualTests
 
-POINTS = 8000  # of a curve over time; zoomed in tenfold that is still one a pixel
-VIEW = 80.0  # lags of the motor that a screen shows at first: single answers are seen there
-COHERENT = 0.6
+MAX_POINTS = 8000  # of a curve over time; zoomed in tenfold that is still one a pixel
+VIEW_LAGS = 80.0  # lags of the motor that a screen shows at first: single answers are seen there
+MIN_COHERENCE = 0.6
 """Below this coherence most of the spectrum at a frequency is not the response to the voltage."""
 
-PAUSE = 20.0
+MAX_MISSING_INTERVALS = 20.0
 """Missing intervals after which a new spectrum begins."""
 
 Role = Literal["estimation", "validation"]
@@ -52,8 +52,8 @@ def fit_charts(wheel: str, parts: Sequence[Comparison], lag: float = 0.0) -> lis
     measured = np.concatenate([part.measured for part in parts])
     simulated = np.concatenate([part.simulated for part in parts])
     voltage = np.concatenate([part.voltage for part in parts])
-    keep = np.union1d(thin(measured, POINTS // 2), thin(simulated, POINTS // 2))
-    name, view = label(wheel), _liveliest(time, measured, spans, VIEW * lag)
+    keep = np.union1d(thin(measured, MAX_POINTS // 2), thin(simulated, MAX_POINTS // 2))
+    name, view = label(wheel), _liveliest(time, measured, spans, VIEW_LAGS * lag)
 
     def chart(kind: str, y_label: str, height: int, *curves: Curve) -> Chart:
         return Chart(
@@ -153,7 +153,7 @@ def _without_pauses(part: Comparison, step: float) -> list[tuple[Array, ...]]:
     known = np.isfinite(part.measured) & np.isfinite(part.simulated)
     whole = (part.time, part.voltage, part.measured, part.simulated)
     columns = [column[known] for column in whole]
-    begins = np.flatnonzero(np.diff(columns[0]) > PAUSE * step) + 1
+    begins = np.flatnonzero(np.diff(columns[0]) > MAX_MISSING_INTERVALS * step) + 1
     return [*zip(*(np.split(column, begins) for column in columns))] if known.any() else []
 
 
@@ -185,7 +185,7 @@ def _response(parts: Sequence[Comparison]) -> tuple[Array, Array, Array, Array] 
     power, own = sums[0].real, sums[1].real
     with np.errstate(invalid="ignore", divide="ignore"):
         coherence = np.abs(sums[2]) ** 2 / (power * own)
-        usable = (coherence > COHERENT) & (power > 1e-6 * power.max())
+        usable = (coherence > MIN_COHERENCE) & (power > 1e-6 * power.max())
     usable[0] = False
     usable[size // 4 :] = False  # above half the Nyquist frequency the hold shapes both
     index = np.flatnonzero(usable)

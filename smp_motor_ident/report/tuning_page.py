@@ -29,14 +29,14 @@ from smp_motor_ident.tune.curves import Curves, curves
 from smp_motor_ident.tune.designer import finish
 from smp_motor_ident.tune.wheels import at_pace_of
 
-SHARES = (0.3, 0.45, 0.65, 0.85, 1.0)
+BANDWIDTH_SHARES = (0.3, 0.45, 0.65, 0.85, 1.0)
 """Of the bandwidth that the method chooses by itself, which is the largest integral gain's."""
 
-MARGINS = (45.0, 60.0, 70.0)  # phase margins that are offered [deg]: lively, usual, calm
-USUAL = 60.0  # what `tune` takes [deg]
-LIMIT = METHODS["margin"].required.sensitivity
+PHASE_MARGINS = (45.0, 60.0, 70.0)  # phase margins that are offered [deg]: lively, usual, calm
+DEFAULT_PHASE_MARGIN = 60.0  # what `tune` takes [deg]
+MAX_SENSITIVITY = METHODS["margin"].required.sensitivity
 
-SAMPLES = 100  # motors that the bands of a choice are over: their ends are the least and largest
+BAND_DRAWS = 100  # motors that the bands of a choice are over: their ends are the least and largest
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,16 +92,22 @@ def tuning_of(estimate: Estimate, loop: Loop, own: Design) -> Tuning:
     """
     choices = [
         Choice(share * own.margins.crossover, margin, own, curves(estimate, own))
-        if share == SHARES[-1] and margin == USUAL
+        if share == BANDWIDTH_SHARES[-1] and margin == DEFAULT_PHASE_MARGIN
         else _choice(estimate, loop, share * own.margins.crossover, margin, own)
-        for margin in MARGINS
-        for share in SHARES
+        for margin in PHASE_MARGINS
+        for share in BANDWIDTH_SHARES
     ]
-    return Tuning(estimate.wheel, choices, MARGINS.index(USUAL) * len(SHARES) + len(SHARES) - 1)
+    return Tuning(
+        estimate.wheel,
+        choices,
+        PHASE_MARGINS.index(DEFAULT_PHASE_MARGIN) * len(BANDWIDTH_SHARES)
+        + len(BANDWIDTH_SHARES)
+        - 1,
+    )
 
 
 def _choice(estimate: Estimate, loop: Loop, bandwidth: float, margin: float, own: Design) -> Choice:
-    asked: dict[str, Any] = dict(bandwidth=bandwidth, phase_margin=margin, samples=SAMPLES)
+    asked: dict[str, Any] = dict(bandwidth=bandwidth, phase_margin=margin, samples=BAND_DRAWS)
     try:
         case = prepare(estimate, loop, "margin", {**asked, "together": own.together})
         found = finish(case, *solve(case))
@@ -117,15 +123,15 @@ def page_charts(tunings: Mapping[str, Tuning]) -> list[Chart]:
         if tuning.choices:
             one = tuning.choices[tuning.chosen]
             assert one.curves is not None and one.design is not None
-            return tuning_charts({tuning.wheel: one.curves}, LIMIT, "tuning-")
+            return tuning_charts({tuning.wheel: one.curves}, MAX_SENSITIVITY, "tuning-")
     return []
 
 
 def page_data(tunings: Mapping[str, Tuning]) -> dict[str, Any]:
     """Return the data of the page's script: by wheel the designs at every place of the sliders."""
     return {
-        "shares": SHARES,
-        "margins": MARGINS,
+        "shares": BANDWIDTH_SHARES,
+        "margins": PHASE_MARGINS,
         "wheels": {
             wheel: dict(chosen=t.chosen, reason=t.reason, choices=[*map(_document, t.choices)])
             for wheel, t in tunings.items()
@@ -138,7 +144,7 @@ def _document(one: Choice) -> dict[str, Any]:
     if one.design is None or one.curves is None:
         return {**asked, "reason": one.reason}
     found = one.design
-    charts = tuning_charts({found.wheel: one.curves}, LIMIT, "tuning-")
+    charts = tuning_charts({found.wheel: one.curves}, MAX_SENSITIVITY, "tuning-")
     head = [
         f"margin, bandwidth {found.margins.crossover:.4g} rad/s, phase margin "
         f"{found.margins.phase:.3g} deg; chosen on the tuning page of the report"

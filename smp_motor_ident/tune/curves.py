@@ -13,7 +13,7 @@ from smp_motor_ident.tune.margins import frequencies
 from smp_motor_ident.tune.motors import draw_motors, motors_of
 from smp_motor_ident.tune.plant import sample
 from smp_motor_ident.tune.problem import noise_density
-from smp_motor_ident.tune.reference import CHANGE, controller_for, planned_change
+from smp_motor_ident.tune.reference import STEP_SHARE, controller_for, planned_change
 from smp_motor_ident.tune.simulation import Controller, Inputs, simulate
 
 DRAWS = 200
@@ -44,7 +44,7 @@ def curves(estimate: Estimate, design: Design) -> Curves:
     drawn = draw_motors(estimate, DRAWS, np.random.default_rng(0))
     plant = sample(nominal if drawn is None else drawn, loop, believed=nominal)
     controller = controller_for(loop, design.feedback)
-    change = CHANGE * design.reference.max_velocity
+    change = STEP_SHARE * design.reference.max_velocity
     slow = float(nominal.a1[0] / nominal.a0[0])
     T = loop.sample_time
     time = T * np.arange(

@@ -11,7 +11,7 @@ from smp_motor_ident.tune.margins import BatchMargins, batch_margins, grid_for
 from smp_motor_ident.tune.plant import Plant
 from smp_motor_ident.tune.problem import Problem, RequiredMargins
 
-SHARE = 0.99
+REQUIRED_SHARE = 0.99
 """Share of the distribution for which the required margins must hold."""
 
 
@@ -56,7 +56,7 @@ class UncertaintyEnsemble:
         holds &= m.sensitivity <= 1.01 * p.sensitivity
         unmodelled = 0.0 if self.nominal is None else self.nominal.unmodelled_gain(feedback)
         holds &= unmodelled <= 1.01
-        low, high = 1 - SHARE, SHARE
+        low, high = 1 - REQUIRED_SHARE, REQUIRED_SHARE
         return Robustness(
             samples=len(self.plant),
             stable=float(np.mean(stable)),
@@ -77,14 +77,14 @@ def back_off(
     so that the loop keeps its shape while its crossover moves down.
     """
     found = assess(feedback)
-    if found.holds >= SHARE:
+    if found.holds >= REQUIRED_SHARE:
         return feedback, 1.0, found
     good, bad = None, 1.0
     factor = 0.97
     while factor > 0.01:
         trial = softer(feedback, factor)
         found = assess(trial)
-        if found.holds >= SHARE:
+        if found.holds >= REQUIRED_SHARE:
             good = factor, trial, found
             break
         bad, factor = factor, factor * factor
@@ -94,7 +94,7 @@ def back_off(
         middle = 0.5 * (good[0] + bad)
         trial = softer(feedback, middle)
         found = assess(trial)
-        if found.holds >= SHARE:
+        if found.holds >= REQUIRED_SHARE:
             good = middle, trial, found
         else:
             bad = middle

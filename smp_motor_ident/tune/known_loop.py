@@ -16,7 +16,7 @@ from smp_motor_control.arrays import Array
 from smp_motor_ident.errors import SignalError
 from smp_motor_ident.finding import Finding
 from smp_motor_ident.record import Record
-from smp_motor_ident.tune.limits import COMMAND_RESOLUTION, LOOP_RATE, TICK_FIT
+from smp_motor_ident.tune.limits import LOOP_RATE_TOLERANCE, MAX_COMMAND_ERROR, TICK_TOLERANCE
 
 Step = Callable[[float, float], float]
 """From set-point, in the target's unit, and speed of the wheel [rad/s] to the command [V]."""
@@ -24,7 +24,7 @@ Step = Callable[[float, float], float]
 INTERVAL_TOLERANCE = 0.5
 """Relative excess of an interval that indicates a lost sample."""
 
-DITHERS = 4
+DITHER_COUNT = 4
 
 
 @dataclass(frozen=True)
@@ -78,7 +78,7 @@ def reconstruct(record: Record, loop: KnownLoop, numbers: Mapping[str, float]) -
     speed, step, counted = _restore_loop_speed(speed, setting)
     volts = _run(loop.start(setting), record.voltage, speed)
     error = _error(loop, setting, record.voltage, speed, step)
-    if error > COMMAND_RESOLUTION.value * supply:
+    if error > MAX_COMMAND_ERROR.value * supply:
         raise SignalError(
             f"{where}: the speed was logged in steps of {step:.3g} rad/s, so the command is known "
             f"to {error:.2g} V only; log more digits, or give counts_per_revolution if this "
@@ -99,7 +99,7 @@ def _interval(record: Record, loop: KnownLoop, numbers: Mapping[str, float]) -> 
     logged, T = record.sample_time, loop.interval(numbers)
     if math.isnan(T):
         return logged
-    if abs(logged / T - 1) > LOOP_RATE.value:
+    if abs(logged / T - 1) > LOOP_RATE_TOLERANCE.value:
         raise SignalError(
             f"{record.source}: {record.wheel}: logged every {1e3 * logged:.4g} ms, and the loop "
             f"ran every {1e3 * T:.4g} ms: commands between two rows are not known; log every step"
@@ -129,8 +129,8 @@ def _restore_loop_speed(speed: Array, setting: Setting) -> tuple[Array, float, d
     if math.isfinite(setting.ticks):
         exact = speed * setting.ticks * setting.sample_time
         ticks = np.rint(exact)
-        whole = np.abs(exact - ticks) < TICK_FIT.value
-        if np.mean(whole) > 1 - TICK_FIT.value:
+        whole = np.abs(exact - ticks) < TICK_TOLERANCE.value
+        if np.mean(whole) > 1 - TICK_TOLERANCE.value:
             counted = {"count": np.cumsum(ticks), "velocity": None} if whole.all() else {}
             return ticks / setting.ticks / setting.sample_time, 0.0, counted
     gaps = np.diff(np.unique(np.abs(speed)))
@@ -155,7 +155,7 @@ def _error(loop: KnownLoop, setting: Setting, setpoints: Array, speed: Array, st
     rng: Any = np.random.default_rng(0)
     plain = _run(loop.start(setting), setpoints, speed)
     errors = []
-    for _ in range(DITHERS):
+    for _ in range(DITHER_COUNT):
         other = speed + rng.uniform(-0.5, 0.5, speed.size) * step
         errors.append(_run(loop.start(setting), setpoints, other) - plain)
     return float(np.sqrt(np.mean(np.square(errors))))

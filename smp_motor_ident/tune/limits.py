@@ -8,48 +8,48 @@ from smp_motor_ident.infer.response_limits import RESONANCE_DAMPING
 from smp_motor_ident.limits import Limit
 
 # Requirements on the model, and limits of the gains.
-FRICTION_KNOWN = Limit(
+MAX_FRICTION_ERROR = Limit(
     0.02,
     "share of the supply",
     "an error of the friction's feed-forward by this changes the speed by as much of its largest "
     "value as the band in which a change counts as settled",
     "test_tune_truth.py",
 )
-FRICTION_RANGE = Limit(
+MAX_FRICTION_RANGE = Limit(
     0.5,
     "share of the supply",
     "with half of the supply unknown the speed that the motor reaches is not known to a factor 2",
     "test_tune_truth.py",
 )
-UNRELIABLE_SPREAD = Limit(
+MIN_UNRELIABLE_STD = Limit(
     0.1,
     "relative standard deviation",
     "least that numbers of an unreliable estimate are drawn with; more where the fit on held-out "
     "data leaves more of the motion unexplained",
     "test_tune_truth.py",
 )
-STATED_GAIN_MARGIN = Limit(
+MAX_STATED_GAIN_MARGIN = Limit(
     10.0,
     "times the gain",
     "physical: a gain ten times as large crosses one where half a row of delay or of a sensor's "
     "window, which no record excludes, turns the phase by tens of degrees",
     "test_tune_truth.py",
 )
-SPEED_NOISE = Limit(
+MAX_SPEED_NOISE = Limit(
     2.5e-3,
     "share of the top speed, rms",
     "four times this is 2 % of half the top speed: with more, counts shake the wheel out of the "
     "band in which the specification calls a change settled",
     "test_tune_methods.py",
 )
-JUMP = Limit(
+MIN_OUTLIER_DEVIATIONS = Limit(
     8.0,
     "standard deviations of a reported speed's noise",
     "significance: two readings differ by more once in 70 million, a day at 1 kHz",
     "test_tune_disturbances.py: outliers do not reach the loop",
 )
 
-UNKNOWN_RESPONSE = Limit(
+UNKNOWN_RESPONSE_ERROR = Limit(
     2.0,
     "of the model's response",
     "assumed relative error at frequencies without excitation: the smallest that Skogestad and "
@@ -57,33 +57,33 @@ UNKNOWN_RESPONSE = Limit(
     "response are unknown",
     "test_tune_unmodelled.py: the loop stays within the excited band",
 )
-RESONANCE = Limit(
+RESONANCE_ERROR = Limit(
     1 / (2 * RESONANCE_DAMPING.value),
     "of the model's response",
     "physical: 1/(2 zeta) of a shaft with the damping ratio 0.05 of steel in its bearings",
     "test_tune_unmodelled.py: error that is shown counts for a resonance",
 )
-RESONANCE_DAMPED = Limit(
+MAX_RESONANCE_DAMPING = Limit(
     0.5,
     "damping ratio",
     "physical: the largest of a shaft; with more, a step causes one swing of 16 % at most",
     "test_tune_unmodelled.py: the effect of a resonance equals that of a simulated one",
 )
-HELD_BACK = Limit(
+MIN_LIMITING_SHARE = Limit(
     0.97,
     "of the tolerated unmodelled dynamics",
     "the step by which gains are reduced: below it another limit holds, and a richer recording "
     "would not help",
     "test_tune_unmodelled.py: the loop stays within the excited band",
 )
-DELAY_BORNE = Limit(
+MAX_DELAY_SHARE = Limit(
     0.5,
     "of the delay margin",
     "this additional delay leaves half of the phase margin; a loop that tolerates less than "
     "`delay_doubt` is not required to tolerate more",
     "test_tune_truth.py",
 )
-AS_GOOD = Limit(
+MAX_SETTLING_LOSS = Limit(
     0.1,
     "of a settling time",
     "cost: a driver does not notice a tenth more settling time, but does notice several times the "
@@ -92,19 +92,19 @@ AS_GOOD = Limit(
 )
 
 # Loops whose commands are reconstructed.
-COMMAND_RESOLUTION = Limit(
+MAX_COMMAND_ERROR = Limit(
     1 / 255,
     "of the supply, rms",
     "one step of an 8-bit PWM, the resolution of a command",
     "test_known_loop.py: unknown commands are refused",
 )
-LOOP_RATE = Limit(
+LOOP_RATE_TOLERANCE = Limit(
     0.02,
     "of the interval",
     "clocks of boards are within 2 %; a log at another rate leaves commands out",
     "test_known_loop.py: unknown commands are refused",
 )
-TICK_FIT = Limit(
+TICK_TOLERANCE = Limit(
     0.05,
     "of a tick",
     "digits that put 95 % of speeds within a twentieth of a whole tick leave no doubt which",
@@ -112,25 +112,25 @@ TICK_FIT = Limit(
 )
 
 # A drive on new gains.
-SETTLED = Limit(
+SETTLING_BAND = Limit(
     0.02,
     "of a change of set-point",
     "the field's usual band of a settling time",
     "test_verification.py: a wheel that does as designed",
 )
-OVERSHOOT = Limit(
+MAX_PLANNED_OVERSHOOT = Limit(
     0.01,
     "of a change of set-point",
     "the largest planned overshoot of the reference: a load or a count may use it up",
     "test_verification.py: a wheel that does as designed",
 )
-SILENCE = Limit(
+MAX_SILENCE = Limit(
     0.1,
     "s without a response",
     "half of wheel_pid's time-out: such a drive tests the computer, not the gains",
     "test_verification.py: a drive without control",
 )
-STEADY_ERROR = Limit(
+MAX_STEADY_ERROR = Limit(
     0.02,
     "of a change of set-point",
     "the same band: integral action leaves no error but the unsettled rest",

@@ -25,7 +25,7 @@ from smp_motor_ident.tune.loop import Loop
 from smp_motor_ident.tune.motors import Motors
 from smp_motor_ident.tune.observer_model import ObserverModel, observer_model
 
-LONGEST = 300
+MAX_LOOP_SAMPLES = 300
 """Largest delay and averaging of a loop [samples]."""
 
 
@@ -182,12 +182,12 @@ def _average(window: Array, tail: Array, T: float) -> Array:
 
 def _check_length(delay: float, window: float, loop: Loop) -> None:
     samples = int(delay / loop.sample_time) + round(window / loop.sample_time)
-    if samples <= LONGEST:
+    if samples <= MAX_LOOP_SAMPLES:
         return
     raise DesignError(
         f"a delay of {1e3 * delay:.4g} ms and a window of {1e3 * window:.4g} ms at "
-        f"{loop.rate:.4g} Hz are {samples} samples, more than the limit of {LONGEST}. "
-        f"Sample at {LONGEST / max(delay + window, loop.sample_time):.3g} Hz or less, or "
+        f"{loop.rate:.4g} Hz are {samples} samples, more than the limit of {MAX_LOOP_SAMPLES}. "
+        f"Sample at {MAX_LOOP_SAMPLES / max(delay + window, loop.sample_time):.3g} Hz or less, or "
         "average over fewer samples"
     )
 

@@ -32,13 +32,13 @@ from smp_motor_ident.tune.plant import Plant, sample
 from smp_motor_ident.tune.problem import checked, measured_lag
 from smp_motor_ident.tune.simulation import Controller, Inputs, simulate, step_figures
 
-HEADROOM = 0.92
+STEADY_VOLTAGE_SHARE = 0.92
 """Share of the supply that a constant speed may use; the rest is left to the feedback."""
 
-PEAK = 0.95
+PEAK_VOLTAGE_SHARE = 0.95
 """Share of the supply that a planned change of speed may use at its peak."""
 
-CHANGE = 0.5
+STEP_SHARE = 0.5
 """Share of the largest speed that the figures of a design are about."""
 
 
@@ -128,7 +128,7 @@ def planned_change(plant: Plant, plan: Reference, distance: float, time: Array) 
 def top_speed(plant: Plant, supply: float) -> float:
     """Return the speed that a motor reaches at the headroom of the supply."""
     m = plant.motors
-    return float((HEADROOM * supply - m.static_voltage[0]) / m.a0[0])
+    return float((STEADY_VOLTAGE_SHARE * supply - m.static_voltage[0]) / m.a0[0])
 
 
 def plan_reference(
@@ -158,7 +158,8 @@ def plan_reference(
         lag=measured_lag(plant, loop.expected_delay),
         doubt=0.0 if targets.get("together") else loop.delay_doubt,
         drive=Drive(
-            top_speed=(PEAK * loop.supply_voltage - float(m.static_voltage[0])) / float(m.a0[0]),
+            top_speed=(PEAK_VOLTAGE_SHARE * loop.supply_voltage - float(m.static_voltage[0]))
+            / float(m.a0[0]),
             time_constant=float(m.a1[0] / m.a0[0]),
             time_constant_product=float(m.a2[0] / m.a0[0]),
         ),
@@ -166,14 +167,14 @@ def plan_reference(
     plan = _quickest(plants, loop, controller, plan, least)
     quickest = plan.transition_time
     if rate is not None or math.isfinite(min(drive, slew)):
-        steepest = _steepest(plan, PEAK * slew / float(m.a0[0]))
-        steepest = min(steepest, PEAK * drive / float(m.a1[0]))
+        steepest = _steepest(plan, PEAK_VOLTAGE_SHARE * slew / float(m.a0[0]))
+        steepest = min(steepest, PEAK_VOLTAGE_SHARE * drive / float(m.a1[0]))
         rate = steepest if rate is None else rate
         if rate > steepest:
             raise DesignError(
                 f"max_acceleration {rate / ratio:.4g} rad/s^2 is beyond the motor: a "
-                f"change by {plan.max_velocity / ratio:.3g} rad/s within {PEAK:.0%} of "
-                f"{loop.supply_voltage:g} V reaches {steepest / ratio:.4g} rad/s^2; ask for that "
+                f"change by {plan.max_velocity / ratio:.3g} rad/s within {PEAK_VOLTAGE_SHARE:.0%} "
+                f"of {loop.supply_voltage:g} V reaches {steepest / ratio:.4g} rad/s^2; ask for that "
                 "or less"
             )
         plan = replace(plan, max_acceleration=rate)
@@ -196,8 +197,8 @@ def _reachable(plant: Plant, loop: Loop, wished: float | None) -> float:
         )
     if wished is not None and wished > top:
         raise DesignError(
-            f"max_velocity {wished / ratio:.4g} rad/s is beyond the motor: {HEADROOM:.0%} of "
-            f"{loop.supply_voltage:g} V reaches {top / ratio:.4g} rad/s; ask for that or less"
+            f"max_velocity {wished / ratio:.4g} rad/s is beyond the motor: "
+            f"{STEADY_VOLTAGE_SHARE:.0%} of {loop.supply_voltage:g} V reaches {top / ratio:.4g} rad/s; ask for that or less"
         )
     return 0.9 * top if wished is None else wished
 

@@ -27,15 +27,15 @@ import numpy as np
 from smp_motor_control.arrays import Array, Complex
 from smp_motor_ident.infer.response_limits import RESONANCE_DAMPING
 from smp_motor_ident.tune.feedback import Feedback
-from smp_motor_ident.tune.limits import RESONANCE_DAMPED, SETTLED
+from smp_motor_ident.tune.limits import MAX_RESONANCE_DAMPING, SETTLING_BAND
 from smp_motor_ident.tune.plant import Plant
 from smp_motor_ident.tune.simulation import settling_time
 from smp_motor_ident.tune.unmodelled import UnmodelledDynamics
 
-COUNT = 40
+FREQUENCY_COUNT = 40
 """Number of resonance frequencies, from the lowest of the bound up to Nyquist."""
 
-DAMPINGS = np.geomspace(RESONANCE_DAMPING.value, RESONANCE_DAMPED.value, 4)
+DAMPINGS = np.geomspace(RESONANCE_DAMPING.value, MAX_RESONANCE_DAMPING.value, 4)
 """Of resonances, evenly spread over those of shafts."""
 
 SHORTEST, LONGEST = 2**13, 2**16
@@ -55,8 +55,8 @@ def added_by_resonance(
     T = plant.sample_time
     nyquist = math.pi / T
     lowest = min(float(unmodelled.frequency[0]), 0.5 * nyquist)
-    at = np.geomspace(lowest, 0.98 * nyquist, COUNT, dtype=np.float64)
-    ringing = -math.log(SETTLED.value) / (RESONANCE_DAMPING.value * unmodelled.known * T)
+    at = np.geomspace(lowest, 0.98 * nyquist, FREQUENCY_COUNT, dtype=np.float64)
+    ringing = -math.log(SETTLING_BAND.value) / (RESONANCE_DAMPING.value * unmodelled.known * T)
     n = 2 ** math.ceil(math.log2(min(max(answer.size + ringing, SHORTEST), LONGEST)))
     usual = np.pad(answer, (0, n - answer.size), mode="edge")
     time = T * np.arange(n, dtype=np.float64)
@@ -86,7 +86,7 @@ def mode(omega: Array, at: Array, damping: float, sample_time: float) -> Complex
 def largest(unmodelled: UnmodelledDynamics, at: Array, damping: float, sample_time: float) -> Array:
     """Return the largest m, up to 1, for which modes stay within the bound."""
     ends = unmodelled.frequency[0], np.pi / sample_time
-    omega = np.union1d(np.geomspace(*ends, 10 * COUNT), at)
+    omega = np.union1d(np.geomspace(*ends, 10 * FREQUENCY_COUNT), at)
     size = np.abs(mode(omega, at, damping, sample_time))
     m: Array = np.minimum((unmodelled.weight(omega) / size).min(axis=1), 1.0)
     return m

@@ -17,7 +17,7 @@ from smp_motor_control.observer import DISTRUST_RATIO, INNOVATION_MEMORY_S
 from smp_motor_ident._compile import compiled
 from smp_motor_ident.chain.terminal import Driver, no_driver, put_out
 from smp_motor_ident.tune.feedback import Feedback
-from smp_motor_ident.tune.limits import SETTLED
+from smp_motor_ident.tune.limits import SETTLING_BAND
 from smp_motor_ident.tune.observer_model import NO_OBSERVER, SPEED
 from smp_motor_ident.tune.plant import Plant
 
@@ -269,7 +269,7 @@ def settled(time: Array, outside: NDArray[np.bool_]) -> float:
     return float(time[last + 1]) if last + 1 < time.size else math.nan
 
 
-def settling_time(time: Array, answer: Array, tolerance: float = SETTLED.value) -> float:
+def settling_time(time: Array, answer: Array, tolerance: float = SETTLING_BAND.value) -> float:
     """Return when the answer to a unit change stays within a tolerance of 1; NaN where never."""
     return settled(time, np.abs(answer - 1.0) > tolerance)
 

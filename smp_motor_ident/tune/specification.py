@@ -11,14 +11,14 @@ from numpy.typing import NDArray
 from smp_motor_control.arrays import Array
 from smp_motor_control.wheel.plausibility import LOAD_SHARE
 from smp_motor_ident.tune.case import Case
-from smp_motor_ident.tune.ensemble import SHARE
+from smp_motor_ident.tune.ensemble import REQUIRED_SHARE
 from smp_motor_ident.tune.feedback import Feedback
-from smp_motor_ident.tune.limits import JUMP, STATED_GAIN_MARGIN
+from smp_motor_ident.tune.limits import MAX_STATED_GAIN_MARGIN, MIN_OUTLIER_DEVIATIONS
 from smp_motor_ident.tune.loop import Loop
 from smp_motor_ident.tune.margins import BatchMargins, Margins
 from smp_motor_ident.tune.plant import Plant, sample
 from smp_motor_ident.tune.problem import Problem
-from smp_motor_ident.tune.reference import CHANGE, Change, Reference, planned_change
+from smp_motor_ident.tune.reference import STEP_SHARE, Change, Reference, planned_change
 from smp_motor_ident.tune.resonance import added_by_resonance
 from smp_motor_ident.tune.simulation import (
     Controller,
@@ -120,7 +120,7 @@ def figures_of(
     """
     problem, (margins, found) = case.problem, kept
     loop = replace(problem.loop, delay=problem.loop.expected_delay)
-    change = CHANGE * reference.max_velocity
+    change = STEP_SHARE * reference.max_velocity
     time = _instants(problem, controller.feedback, reference)
     plan = planned_change(usual, reference, change, time)
     run = simulate(usual, controller, plan.inputs)
@@ -225,7 +225,10 @@ def _reported_noise(case: Case, loop: Loop, shape: tuple[int, int]) -> Array | f
     motor = case.problem.plant.motors
     top = loop.supply_voltage / float(motor.a0[0])
     load = LOAD_SHARE * loop.supply_voltage + case.swallowed
-    believed = JUMP.value * loop.reported_noise + load / float(motor.a1[0]) * loop.sample_time
+    believed = (
+        MIN_OUTLIER_DEVIATIONS.value * loop.reported_noise
+        + load / float(motor.a1[0]) * loop.sample_time
+    )
     rng = np.random.default_rng(2)
     there = rng.random(shape) < case.outliers * min(believed / top, 1.0)
     return np.asarray(noise + np.where(there, believed * rng.uniform(-1.0, 1.0, shape), 0.0))
@@ -257,14 +260,14 @@ def _performance(
 def band(value: float, over: Sequence[float] | Array, added: float = 0.0) -> Band:
     """Return a figure's band, whose high end is raised by ``added``."""
     rising = np.sort(np.asarray(over, dtype=np.float64))  # NaN last
-    beyond = int((1 - SHARE) * (rising.size - 1))
+    beyond = int((1 - REQUIRED_SHARE) * (rising.size - 1))
     low, high = np.fmin(rising[beyond], value), np.maximum(rising[-1 - beyond], value)
     return Band(value, float(low), float(high) + added)
 
 
 def _stated(gain: Band) -> Band:
     """Return a gain margin's band, whose low end is no larger than a record can vouch for."""
-    return replace(gain, low=min(gain.low, STATED_GAIN_MARGIN.value))
+    return replace(gain, low=min(gain.low, MAX_STATED_GAIN_MARGIN.value))
 
 
 def _instants(problem: Problem, fb: Feedback, reference: Reference) -> Array:

@@ -22,7 +22,7 @@ import numpy as np
 
 from smp_motor_control.arrays import Array
 from smp_motor_ident.result import Estimate
-from smp_motor_ident.tune.limits import RESONANCE, UNKNOWN_RESPONSE
+from smp_motor_ident.tune.limits import RESONANCE_ERROR, UNKNOWN_RESPONSE_ERROR
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,7 +34,7 @@ class UnmodelledDynamics:
 
     def weight(self, omega: Array) -> Array:
         """Return the bound at some frequencies [rad/s]; nothing is known beyond the last."""
-        right = UNKNOWN_RESPONSE.value
+        right = UNKNOWN_RESPONSE_ERROR.value
         bound: Array = np.interp(np.log(omega), np.log(self.frequency), self.bound, right=right)
         return bound
 
@@ -58,8 +58,10 @@ def unmodelled_dynamics(estimate: Estimate) -> UnmodelledDynamics | None:
         return None
     shown, bound = np.array(error.shown), np.array(error.bound)
     least = 2 * shown - bound
-    taken = np.minimum(bound, np.where(least > 0, RESONANCE.value, UNKNOWN_RESPONSE.value))
-    taken = np.where(least > 1, RESONANCE.value, taken)
+    taken = np.minimum(
+        bound, np.where(least > 0, RESONANCE_ERROR.value, UNKNOWN_RESPONSE_ERROR.value)
+    )
+    taken = np.where(least > 1, RESONANCE_ERROR.value, taken)
     lowest = int(np.argmax(taken < 1))
     slower = (np.arange(taken.size) < lowest) & ~(least > 0)
     taken = np.where(slower, taken[lowest], taken)

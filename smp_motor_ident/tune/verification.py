@@ -25,26 +25,26 @@ from smp_motor_control.wheel.loop import LoopSettings, WheelLoop
 from smp_motor_ident.finding import Finding
 from smp_motor_ident.result import Estimate
 from smp_motor_ident.tune.limits import (
-    COMMAND_RESOLUTION,
     DRIVE_LEVEL,
-    OVERSHOOT,
-    SETTLED,
-    SILENCE,
-    STEADY_ERROR,
+    MAX_COMMAND_ERROR,
+    MAX_PLANNED_OVERSHOOT,
+    MAX_SILENCE,
+    MAX_STEADY_ERROR,
+    SETTLING_BAND,
 )
 from smp_motor_ident.tune.motors import draw_motors, motors_of
 from smp_motor_ident.tune.simulation import settling_time
 
-SMOOTHING = 0.05
+SMOOTHING_S = 0.05
 """Length [s] of the parabola whose slope is taken as the speed."""
 
-STEADY = 0.3
+STEADY_TIME_S = 0.3
 """End of a change that is taken as steady [s]."""
 
 DRAWS = 12
 """Motors in addition to the nominal one."""
 
-UNKNOWN = 0.1
+MAX_UNKNOWN_SHARE = 0.1
 """Largest share of samples whose voltage matches no command."""
 
 _TIME = "raise the scheduling_priority of the wheels' nodes, and reduce the load of the network"
@@ -54,7 +54,7 @@ _WHEEL = (
     "motor that changed since; then commission again"
 )
 
-SIGMAS = 3.0
+RESOLUTION_SIGMAS = 3.0
 """Of the speed's resolution that a reading may be off."""
 
 
@@ -89,7 +89,7 @@ class Change:
 def smoothed(time: Array, angle: Array, step: float) -> tuple[Array, Array]:
     """Return instants at an even distance and the speed there, from angles at any."""
     even = np.arange(time[0], time[-1], step)
-    window = max(2 * round(SMOOTHING / step / 2) + 1, 5)
+    window = max(2 * round(SMOOTHING_S / step / 2) + 1, 5)
     held = np.interp(even, time, angle)
     speed = savgol_filter(held, window, 2, deriv=1, delta=step)
     return even, np.asarray(speed, dtype=np.float64)
@@ -101,7 +101,7 @@ def resolution(quantum: float, step: float) -> float:
     The slope of a parabola over n samples: ``sqrt(12 / n^3) / step`` of the deviation of one,
     which is ``quantum / sqrt(12)``.
     """
-    n = max(2 * round(SMOOTHING / step / 2) + 1, 5)
+    n = max(2 * round(SMOOTHING_S / step / 2) + 1, 5)
     return float(quantum / (step * n**1.5))
 
 
@@ -109,7 +109,7 @@ def read(time: Array, speed: Array, setpoint: float, tolerance: float) -> Readin
     """Read a change from zero at time zero; ``tolerance`` is a share of the set-point."""
     relative = speed / setpoint
     settling = settling_time(time, relative, tolerance)
-    late = time > time[-1] - STEADY
+    late = time > time[-1] - STEADY_TIME_S
     return Reading(
         settling=math.inf if math.isnan(settling) else settling,
         overshoot=float(max(100 * (relative.max() - 1.0), 0.0)),
@@ -132,7 +132,7 @@ def arrival_delays(
     (asked, ages, commands), (time, voltage) = answers, applied
     sent = asked + ages
     usual = np.maximum(ages, float(loop.get("usual_delay") or loop["delay"]))
-    step = COMMAND_RESOLUTION.value * float(loop["supply_voltage"])
+    step = MAX_COMMAND_ERROR.value * float(loop["supply_voltage"])
     effective = np.zeros(time.size, dtype=np.intp)
     strange, unknown = 0, np.zeros(time.size, dtype=np.bool_)
     for k in range(1, time.size):
@@ -143,7 +143,7 @@ def arrival_delays(
         # No voltage may be an old command's, or a new one's in a dead zone.
         unknown[k] = last > 0 and not newest and (not alike.size or abs(voltage[k]) <= step)
         effective[k] = effective[k - 1] + (alike[-1] if alike.size else 0)
-    if strange > UNKNOWN * time.size:
+    if strange > MAX_UNKNOWN_SHARE * time.size:
         return usual
     first = np.searchsorted(effective, np.arange(asked.size), side="left")
     begun = time[np.clip(first - 1, 0, time.size - 1)]
@@ -212,15 +212,16 @@ def bands_of(
     Simulations (as :func:`predicted` returns them) count as prediction limits; what sampling and
     the resolution of the speed, ``unsure`` [rad/s], add comes on top.
     """
-    margin = SIGMAS * unsure / abs(setpoint)
-    simulated = [read(time, row, setpoint, SETTLED.value + margin) for row in rows]
+    margin = RESOLUTION_SIGMAS * unsure / abs(setpoint)
+    simulated = [read(time, row, setpoint, SETTLING_BAND.value + margin) for row in rows]
     settling = [one.settling for one in simulated] + [_high(specification, "settling")]
     overshoot = [one.overshoot for one in simulated] + [_high(specification, "overshoot")]
     step = float(np.median(np.diff(time)))
     return Reading(
         settling=max(*settling, _limit(settling[:-1])) + 2 * step,
-        overshoot=max(*overshoot, _limit(overshoot[:-1])) + 100 * (OVERSHOOT.value + margin),
-        error=_limit([one.error for one in simulated]) + 100 * (STEADY_ERROR.value + margin),
+        overshoot=max(*overshoot, _limit(overshoot[:-1]))
+        + 100 * (MAX_PLANNED_OVERSHOOT.value + margin),
+        error=_limit([one.error for one in simulated]) + 100 * (MAX_STEADY_ERROR.value + margin),
     )
 
 
@@ -243,7 +244,9 @@ def change_of(
     """Return a change from a speed ``before`` it [rad/s], with its reading and its bands."""
     moved, change = speed - before, setpoint - before
     # The planned overshoot does not count as unsettled.
-    tolerance = SETTLED.value + OVERSHOOT.value + SIGMAS * unsure / abs(change)
+    tolerance = (
+        SETTLING_BAND.value + MAX_PLANNED_OVERSHOOT.value + RESOLUTION_SIGMAS * unsure / abs(change)
+    )
     expected = read(time, rows[0] - before, change, tolerance)
     return Change(
         wheel, name, setpoint, time, speed, rows.min(axis=0), rows[0], rows.max(axis=0),
@@ -251,7 +254,9 @@ def change_of(
         expected,
         bands_of(rows - before, time, change, specification, unsure),
         tolerance,
-        expected.overshoot - _high(specification, "overshoot") - 100 * (tolerance - SETTLED.value),
+        expected.overshoot
+        - _high(specification, "overshoot")
+        - 100 * (tolerance - SETTLING_BAND.value),
     )  # fmt: skip
 
 
@@ -297,9 +302,9 @@ def slow_answers(changes: Sequence[Change]) -> list[Finding]:
 
 def disturbed(silence: float) -> list[Finding]:
     """Return the finding where a wheel was without control for a while [s]."""
-    if silence <= SILENCE.value:
+    if silence <= MAX_SILENCE.value:
         return []
-    evidence = {"silence": silence, "limit": SILENCE.value}
+    evidence = {"silence": silence, "limit": MAX_SILENCE.value}
     text = f"a wheel received no command for {silence:.2f} s"
     return [Finding("verification_disturbed", "refused", text, evidence, _TIME)]
 

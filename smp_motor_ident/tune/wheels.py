@@ -20,7 +20,7 @@ from smp_motor_ident.tune.loop import Loop
 
 Sets = Literal["auto", "one", "each"]
 
-WORTH = 1.1
+MAX_REJECTION_LOSS = 1.1
 """Loss of load rejection, as a factor, up to which one set of gains is preferred."""
 
 
@@ -159,7 +159,7 @@ def _choose(
                 "much; ask for one set each, or for smaller margins"
             )
         return None, "one set of gains each: no set keeps the margins on all wheels"
-    if sets == "auto" and best[0] > WORTH:
+    if sets == "auto" and best[0] > MAX_REJECTION_LOSS:
         return None, (
             f"one set of gains each: a set that holds for all would let a load pull a wheel down "
             f"{best[0]:.2f} times as far"

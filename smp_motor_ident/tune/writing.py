@@ -18,12 +18,12 @@ from smp_motor_control.wheel.loop import LoopSettings
 from smp_motor_control.wheel.stop import MAX_STOP_TIME_S
 from smp_motor_ident.result import plain
 from smp_motor_ident.tune.designer import Design
-from smp_motor_ident.tune.limits import JUMP
+from smp_motor_ident.tune.limits import MIN_OUTLIER_DEVIATIONS
 from smp_motor_ident.tune.loop import Loop
 
 SCHEMA = 1
 
-RESERVE = 1.25
+STOP_TIME_FACTOR = 1.25
 """Safety factor on the computed time in which a reference stops from full speed."""
 
 
@@ -56,7 +56,7 @@ def _patience(design: Design) -> dict[str, float]:
     profile, sample_time = reference.profile(), design.loop.sample_time
     profile.reset(float(reference.max_velocity))
     profile.set_target(0.0, sample_time)
-    stop = RESERVE * (profile.duration + reference.lag + reference.doubt)
+    stop = STOP_TIME_FACTOR * (profile.duration + reference.lag + reference.doubt)
     if stop > MAX_STOP_TIME_S:
         raise ParameterError(
             f"sampled every {sample_time:.3g} s, a wheel would stop {stop:.3g} s after a set-point "
@@ -114,7 +114,9 @@ def _plausible(top_speed: float, loop: Loop) -> dict[str, float]:
     if 2 * top_speed > usual:
         limits["implausible_velocity"] = 2 * top_speed
     if loop.reported_noise:
-        limits["implausible_jump"] = JUMP.value * loop.reported_noise / loop.gear_ratio
+        limits["implausible_jump"] = (
+            MIN_OUTLIER_DEVIATIONS.value * loop.reported_noise / loop.gear_ratio
+        )
     return limits
 
 

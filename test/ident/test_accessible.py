@@ -29,9 +29,9 @@ pytestmark = pytest.mark.skipif(not CHROMIUM, reason="no Chromium on this machin
 
 def report(monkeypatch: pytest.MonkeyPatch) -> str:
     """Of two motors, one with a tuning page, and one that failed."""
-    monkeypatch.setattr(tuning_page, "SHARES", (0.5, 1.0))
-    monkeypatch.setattr(tuning_page, "MARGINS", (60.0,))
-    monkeypatch.setattr(tuning_page, "SAMPLES", 20)
+    monkeypatch.setattr(tuning_page, "BANDWIDTH_SHARES", (0.5, 1.0))
+    monkeypatch.setattr(tuning_page, "PHASE_MARGINS", (60.0,))
+    monkeypatch.setattr(tuning_page, "BAND_DRAWS", 20)
     loop = Loop(sample_time=0.005, gear_ratio=65.5, counts_per_revolution=500, supply_voltage=12.0)
     time = np.arange(4000) * 0.005
     voltage = 8 * np.sign(np.sin(2 * np.pi * 0.37 * time))

@@ -339,4 +339,4 @@ def test_a_motor_that_is_not_known_well_enough_is_recorded_once_more() -> None:
     sent = more.excitation
     assert sent.signal == "fourier" and sent.amplitude <= 6.0 and sent.band is not None
     # The tones lie around the motor's corner, 4 Hz.
-    assert sent.band[0] < 4.0 < sent.band[1] and 5.0 <= sent.duration <= plan.LONGEST
+    assert sent.band[0] < 4.0 < sent.band[1] and 5.0 <= sent.duration <= plan.MAX_FURTHER_S

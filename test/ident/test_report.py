@@ -188,9 +188,9 @@ def test_a_browser_draws_every_chart_zooms_and_asks_nobody(page: str, tmp_path: 
 def test_sliders_of_the_tuning_page_choose_designs_that_tune_has_made(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(tuning_page, "SHARES", (0.5, 1.0))
-    monkeypatch.setattr(tuning_page, "MARGINS", (60.0,))
-    monkeypatch.setattr(tuning_page, "SAMPLES", 20)
+    monkeypatch.setattr(tuning_page, "BANDWIDTH_SHARES", (0.5, 1.0))
+    monkeypatch.setattr(tuning_page, "PHASE_MARGINS", (60.0,))
+    monkeypatch.setattr(tuning_page, "BAND_DRAWS", 20)
     loop = Loop(sample_time=0.005, gear_ratio=65.5, counts_per_revolution=500, supply_voltage=12.0)
     tuning = tuning_page.tuning_of(estimate(), loop, design(estimate(), loop))
     soft, own = tuning.choices

@@ -130,8 +130,8 @@ def test_a_folder_that_cannot_be_written_is_named_before_anything_is_designed(
 
 
 def test_tune_the_tuning_page_and_the_file_state_one_settling(identified, capsys, monkeypatch):
-    monkeypatch.setattr(tuning_page, "SHARES", (0.6, 1.0))
-    monkeypatch.setattr(tuning_page, "MARGINS", (60.0,))
+    monkeypatch.setattr(tuning_page, "BANDWIDTH_SHARES", (0.6, 1.0))
+    monkeypatch.setattr(tuning_page, "PHASE_MARGINS", (60.0,))
     estimates = read_identification(identified)
     fast = replace(estimates["front_right"].combinations["dc_gain"], value=16.8)
     slower = {**estimates["front_right"].combinations, "dc_gain": fast}

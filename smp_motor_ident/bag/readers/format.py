@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from smp_motor_ident.bag.limits import WIDEST
+from smp_motor_ident.bag.limits import MAX_COLUMNS
 from smp_motor_ident.bag.storage import TABLE, Batch, Channel, Table, damaged
 from smp_motor_ident.bag.unpack import Budget
 from smp_motor_ident.errors import BagError
@@ -19,8 +19,10 @@ from smp_motor_ident.finding import Finding
 
 def check_width(count: int, name: str, what: str = "columns") -> None:
     """Raise `BagError` for more columns or topics than a robot's log can have."""
-    if count > WIDEST.value:
-        raise BagError(f"{name}: has more than {WIDEST.value:.0f} {what}; keep those of the motors")
+    if count > MAX_COLUMNS.value:
+        raise BagError(
+            f"{name}: has more than {MAX_COLUMNS.value:.0f} {what}; keep those of the motors"
+        )
 
 
 class Source(ABC):

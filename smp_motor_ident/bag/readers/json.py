@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from smp_motor_ident.bag.limits import STRAY_ROWS, WIDEST
+from smp_motor_ident.bag.limits import MAX_COLUMNS, MAX_STRAY_ROW_SHARE
 from smp_motor_ident.bag.readers import grid
 from smp_motor_ident.bag.readers.format import ColumnFile, Format
 from smp_motor_ident.bag.storage import damaged
@@ -64,7 +64,7 @@ def _open(path: Path, name: str, budget: Budget) -> ColumnFile:
         columns, units, radius = _sysid(document, name)
     else:
         try:
-            columns = dict(islice(_columns("", document, 0, dates), round(WIDEST.value) + 1))
+            columns = dict(islice(_columns("", document, 0, dates), round(MAX_COLUMNS.value) + 1))
         except RecursionError:
             raise BagError(f"{name}: is nested too deeply") from None
     problems = [damaged(problem)] if problem else []
@@ -98,9 +98,9 @@ def _lines(text: str, name: str) -> tuple[list[Any], str]:
             rows.append(json.loads(line))
         except ValueError:
             bad += 1
-            if bad > 1 + STRAY_ROWS.value * len(lines):
+            if bad > 1 + MAX_STRAY_ROW_SHARE.value * len(lines):
                 break
-    if not rows or bad > max(1, STRAY_ROWS.value * len(rows)):
+    if not rows or bad > max(1, MAX_STRAY_ROW_SHARE.value * len(rows)):
         raise ValueError(f"{bad} of {bad + len(rows)} lines are not JSON")
     return rows, f"{name}: {bad} lines that are not JSON were left out" if bad else ""
 

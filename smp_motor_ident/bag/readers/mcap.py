@@ -21,7 +21,7 @@ from smp_motor_ident.bag.storage import Batch, Bytes, Channel, gather, message_t
 from smp_motor_ident.bag.unpack import Budget, decompress
 from smp_motor_ident.errors import BagError
 
-NUMBERED = "publication_sequence"
+SEQUENCE_KEY = "publication_sequence"
 """Key of a channel's metadata: ``true`` where sequence numbers are the publisher's."""
 _BLOCK = 1 << 22
 
@@ -189,7 +189,7 @@ class _McapFile(Messages):
             definition=schema.data.decode("utf-8", "replace") if schema else "",
             definition_format=schema.encoding if schema else "",
             qos=channel.metadata.get("offered_qos_profiles", ""),
-            numbered=channel.metadata.get(NUMBERED) == "true",
+            numbered=channel.metadata.get(SEQUENCE_KEY) == "true",
         )
 
     def _skippable(self, start: int, wanted: Callable[[Channel], bool]) -> bool:

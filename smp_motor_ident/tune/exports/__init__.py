@@ -15,7 +15,8 @@ from smp_motor_ident.tune.exports import (
     ros_arduino_bridge,
     wpilib,
 )
-from smp_motor_ident.tune.exports.target import BAND, Check, Format, Gains, check
+from smp_motor_ident.tune.exports.target import Check, Format, Gains, check
+from smp_motor_ident.tune.limits import SETTLING_BAND
 from smp_motor_ident.tune.loop import Loop
 from smp_motor_ident.tune.wheels import Sets, design_wheels
 
@@ -59,7 +60,7 @@ def export(
 
 
 def _settles(one: Check) -> str:
-    if one.resting_error > BAND:
+    if one.resting_error > SETTLING_BAND.value:
         return f"rests within {one.resting_error:.1%} of it, as whole numbers allow"
     if math.isnan(one.step.settling):
         return "does not settle within 2 %"

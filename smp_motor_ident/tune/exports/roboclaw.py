@@ -19,7 +19,6 @@ from collections.abc import Mapping
 from smp_motor_ident.errors import DesignError
 from smp_motor_ident.tune.designer import Design
 from smp_motor_ident.tune.exports.target import (
-    BAND,
     Format,
     Gains,
     check,
@@ -28,10 +27,11 @@ from smp_motor_ident.tune.exports.target import (
     top_speed,
 )
 from smp_motor_ident.tune.feedback import Feedback
+from smp_motor_ident.tune.limits import SETTLING_BAND
 
-UNIT = 65536
+FIXED_POINT_ONE = 65536
 
-SHARES = tuple(2.0 ** (-n / 2) for n in range(13))
+GAIN_SHARES = tuple(2.0 ** (-n / 2) for n in range(13))
 """Of the designed gains, tried from the largest on: P takes one, I its square."""
 
 
@@ -46,14 +46,14 @@ def _convert(design: Design) -> Gains:
     forward = loop.supply_voltage * ticks(loop) / qpps
 
     def gains(share: float) -> Gains:
-        p = round(share * max(wanted.p, 0.0) * scale * UNIT)
-        i = round(share**2 * wanted.i * scale * UNIT)
-        feedback = Feedback((p + i * T) / UNIT / scale, i / UNIT / scale)
+        p = round(share * max(wanted.p, 0.0) * scale * FIXED_POINT_ONE)
+        i = round(share**2 * wanted.i * scale * FIXED_POINT_ONE)
+        feedback = Feedback((p + i * T) / FIXED_POINT_ONE / scale, i / FIXED_POINT_ONE / scale)
         numbers = {"P": p, "I": i, "D": 0, "QPPS": qpps}
         return Gains(numbers, feedback, velocity=forward, tracking=max(p / max(i, 1), T))
 
-    tried = map(gains, SHARES)
-    most = 100 * BAND
+    tried = map(gains, GAIN_SHARES)
+    most = 100 * SETTLING_BAND.value
     return next((one for one in tried if check(design, one).step.overshoot <= most), gains(0.0))
 
 
@@ -62,8 +62,8 @@ def _render(designs: Mapping[str, Design], gains: Mapping[str, Gains]) -> str:
     for wheel, one in gains.items():
         n = one.numbers
         lines.append(
-            f"{wheel}: P {n['P']} ({n['P'] / UNIT:.5g}), I {n['I']} ({n['I'] / UNIT:.5g}), "
-            f"D {n['D']}, QPPS {n['QPPS']}"
+            f"{wheel}: P {n['P']} ({n['P'] / FIXED_POINT_ONE:.5g}), "
+            f"I {n['I']} ({n['I'] / FIXED_POINT_ONE:.5g}), D {n['D']}, QPPS {n['QPPS']}"
         )
     return "\n".join(lines) + "\n"
 

@@ -31,7 +31,7 @@ from smp_motor_ident.tune.exports.target import (
 from smp_motor_ident.tune.feedback import Feedback
 from smp_motor_ident.tune.known_loop import KnownLoop, Setting, Step
 
-MAX_PWM, LARGEST, INT16 = 255, 1000, 32767
+MAX_PWM, MAX_GAIN, INT16 = 255, 1000, 32767
 
 
 def _convert(design: Design) -> Gains:
@@ -43,7 +43,7 @@ def _convert(design: Design) -> Gains:
     # ``Kp`` takes the present error: so much less is left to the proportional action.
     integral = design.feedback.i * T * scale
     proportional = max(design.feedback.p - design.feedback.i * T, 0.0) * scale
-    largest = min(LARGEST, INT16 / (top_speed(design) * ticks(loop) * T))
+    largest = min(MAX_GAIN, INT16 / (top_speed(design) * ticks(loop) * T))
     Ko = _find_divisor(integral, proportional, largest)
     Kp, Kd = max(round(integral * Ko), 1), round(proportional * Ko)
     kp, kd = Kp / Ko / scale, Kd / Ko / scale
@@ -80,7 +80,7 @@ def _start(setting: Setting) -> Step:
 
 def _find_divisor(integral: float, proportional: float, largest: float) -> int:
     """Return the ``Ko`` with the smallest rounding error of two integer gains."""
-    most = max(min(int(largest / max(integral, proportional)), LARGEST), 1)
+    most = max(min(int(largest / max(integral, proportional)), MAX_GAIN), 1)
 
     def error(Ko: int) -> float:
         one = abs(max(round(integral * Ko), 1) / (integral * Ko) - 1)

@@ -11,11 +11,12 @@ from smp_motor_ident.errors import DesignError
 from smp_motor_ident.tune.designer import Design
 from smp_motor_ident.tune.feedback import Feedback
 from smp_motor_ident.tune.known_loop import KnownLoop
+from smp_motor_ident.tune.limits import SETTLING_BAND
 from smp_motor_ident.tune.loop import Loop
 from smp_motor_ident.tune.margins import Margins, loop_margins
 from smp_motor_ident.tune.motors import Motors
 from smp_motor_ident.tune.plant import Plant, sample
-from smp_motor_ident.tune.reference import CHANGE
+from smp_motor_ident.tune.reference import STEP_SHARE
 from smp_motor_ident.tune.simulation import Controller, Inputs, StepFigures, simulate, step_figures
 
 
@@ -67,7 +68,6 @@ class Check:
     resting_error: float  # largest error at rest as a share of that change [-]
 
 
-BAND = 0.02  # within which a change of set-point counts as settled
 MILLISECOND = 1e-3
 """Tolerance for whole milliseconds, since rates have six digits."""
 
@@ -84,7 +84,7 @@ def plant_of(design: Design) -> Plant:
 def check(design: Design, gains: Gains) -> Check:
     """Compute margins and step response of the loop that the target runs."""
     loop, plant = design.loop, plant_of(design)
-    target = CHANGE * design.reference.max_velocity
+    target = STEP_SHARE * design.reference.max_velocity
     steps = int(duration(design, gains) / loop.sample_time)
     time = loop.sample_time * np.arange(steps, dtype=np.float64)
     controller = Controller(
@@ -95,7 +95,7 @@ def check(design: Design, gains: Gains) -> Check:
     friction = np.array([design.motor["static_voltage"]])
     run = simulate(plant, controller, inputs, friction=friction)
     step = step_figures(time, run.speed[0], run.voltage[0], target)
-    if gains.resting_error > BAND * target:
+    if gains.resting_error > SETTLING_BAND.value * target:
         step = replace(step, settling=math.nan)
     return Check(loop_margins(plant, gains.feedback), step, gains.resting_error / target)
 
@@ -111,11 +111,11 @@ def duration(design: Design, gains: Gains) -> float:
     tail = 0.0
     if fb.i > 0:
         slow = (fb.p + a0) / fb.i
-        target = CHANGE * design.reference.max_velocity
+        target = STEP_SHARE * design.reference.max_velocity
         needed = a0 + (design.motor["static_voltage"] - gains.static) / target
         given = gains.velocity + fb.p * (gains.weight - 1)
         left = abs(given - needed) / (fb.p + a0) + rise / slow
-        tail = slow * max(math.log(10 * left / BAND), 0.0)
+        tail = slow * max(math.log(10 * left / SETTLING_BAND.value), 0.0)
     return float(0.5 + 12 * rise + tail)
 
 

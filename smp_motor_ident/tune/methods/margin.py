@@ -19,7 +19,7 @@ import numpy as np
 from smp_motor_control.arrays import Array
 from smp_motor_ident.errors import DesignError
 from smp_motor_ident.tune.feedback import Feedback, spectral_radius, terms
-from smp_motor_ident.tune.limits import SPEED_NOISE
+from smp_motor_ident.tune.limits import MAX_SPEED_NOISE
 from smp_motor_ident.tune.margins import loop_margins
 from smp_motor_ident.tune.methods.simc import SIMC
 from smp_motor_ident.tune.problem import Method, Problem, RequiredMargins
@@ -30,7 +30,7 @@ MAX_NOISE_RAISES, CONTROL_NOISE_TARGET, SPEED_NOISE_TARGET = 8, 1.2, 1.0
 """Largest number of raises of a default noise limit, each by a fifth, and the integral gain
 relative to SIMC's at which they end: for noise in the control, and for noise in the speed."""
 
-PEAK = {"balanced": 1.25, "tracking": 1.05, "load": math.inf}
+MAX_COMPLEMENTARY_PEAK = {"balanced": 1.25, "tracking": 1.05, "load": math.inf}
 """Largest peak of the complementary sensitivity, by focus."""
 
 
@@ -177,7 +177,7 @@ def _best(
     c = _candidates(problem, crossovers, margins, shares)
     if c.p.size == 0:
         return None
-    good = _hold(problem, c, margin, peak, PEAK[focus])
+    good = _hold(problem, c, margin, peak, MAX_COMPLEMENTARY_PEAK[focus])
     merit = np.where(good, c.crossover if focus == "tracking" else c.i, -np.inf)
     for k in np.argsort(-merit)[:20]:
         if not good[k]:
@@ -227,7 +227,7 @@ def _hold(problem: Problem, c: _Candidates, margin: float, peak: float, hump: fl
     good &= problem.noise_rms(control * back) <= problem.loop.noise_limit
     shaking = problem.noise_rms(control * back * problem.true_response)
     top = problem.loop.supply_voltage / float(problem.plant.motors.a0[0])
-    return np.asarray(good & (shaking <= problem.shaking * SPEED_NOISE.value * top))
+    return np.asarray(good & (shaking <= problem.shaking * MAX_SPEED_NOISE.value * top))
 
 
 def _at_bandwidth(problem: Problem, wished: float, margin: float, peak: float) -> Feedback:
