@@ -34,8 +34,8 @@ def check_wheel_names(names: Sequence[str]) -> None:
     for name in names:
         if not re.fullmatch(r"[A-Za-z][A-Za-z0-9_]*", name) or len(name) > MAX_NAME_LENGTH:
             raise ParameterError(
-                f"wheel name {name!r}: must be letters, digits and _ after a letter, at most "
+                f"wheel name {name!r}; it must be letters, digits and _ after a letter, at most "
                 f"{MAX_NAME_LENGTH}, as in a topic"
             )
     if twice := sorted({name for name in names if list(names).count(name) > 1}):
-        raise ParameterError(f"a wheel is named twice: {', '.join(twice)}")
+        raise ParameterError(f"a wheel is named twice: {', '.join(twice)}; rename one")

@@ -155,7 +155,7 @@ class SpeedObserver:
     ) -> None:
         check_range("sample_time of the observer", sample_time, 1e-7, 1e3, "s")
         if not max_load > 0.0:
-            raise ParameterError(f"max_load of the observer is {max_load} V: must be positive")
+            raise ParameterError(f"max_load of the observer is {max_load} V; it must be positive")
         self._model, self._max_load = model, max_load
         self._free = FreeResponse(model.time_constant, model.time_constant_product)
         self._quantum = encoder.angle_per_count
@@ -193,7 +193,9 @@ class SpeedObserver:
     def step(self, count: int, voltage: float, dt: float) -> float:
         """Return the speed [rad/s] after one more sample."""
         if not 0.0 < dt < math.inf or voltage - voltage != 0.0:
-            raise ParameterError(f"observer got {voltage} V over {dt} s: must be finite, dt > 0")
+            raise ParameterError(
+                f"the observer got {voltage} V over {dt} s; both must be finite, dt positive"
+            )
         total = self._unwrap(count)
         self._time += dt
         differenced = self._differenced.step(self._time, total)

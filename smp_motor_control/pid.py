@@ -143,7 +143,7 @@ class Pid:
         if not EPSILON < dt < _INF:
             if -EPSILON <= dt <= EPSILON:
                 return self._last_output
-            raise ParameterError(f"dt is {dt} s: must be finite and not negative")
+            raise ParameterError(f"dt is {dt} s; it must be finite and not negative")
         error = reference - measurement
         weighted = self._weight_d * reference - measurement
         rate = self._filtered_rate(weighted, measurement, dt, error_rate)

@@ -118,5 +118,5 @@ def _check_strategy(value: object) -> None:
         )
     if value not in STRATEGIES:
         raise ParameterError(
-            f"antiwindup_strategy is {value!r}: must be one of {', '.join(STRATEGIES)}"
+            f"antiwindup_strategy is {value!r}; it must be one of {', '.join(STRATEGIES)}"
         )

@@ -53,7 +53,7 @@ class SkidSteer:
         for field in fields(self):
             value = getattr(self, field.name)
             if not value > 0.0 or (math.isinf(value) and field.name != "max_wheel_speed"):
-                raise ParameterError(f"{field.name} is {value}: must be positive and finite")
+                raise ParameterError(f"{field.name} is {value}; it must be positive and finite")
 
     @property
     def effective_separation(self) -> float:

@@ -73,9 +73,9 @@ class Odometry:
     ) -> None:
         self.configure(wheel_separation, left_radius, right_radius, travel_noise, turn_noise)
         if window < 1:
-            raise ParameterError(f"window is {window} steps: must be at least 1")
+            raise ParameterError(f"window is {window} steps; it must be at least 1")
         if not max_wheel_speed > 0.0:
-            raise ParameterError(f"max_wheel_speed is {max_wheel_speed} rad/s: must be positive")
+            raise ParameterError(f"max_wheel_speed is {max_wheel_speed} rad/s; it must be positive")
         self.max_wheel_speed = max_wheel_speed
         self._velocities: deque[tuple[float, float]] = deque(maxlen=window)
         self.reset()

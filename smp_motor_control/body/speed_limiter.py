@@ -124,7 +124,7 @@ def _limit_pair(name: str, lower: float | None, upper: float | None) -> tuple[fl
     if not lower <= 0.0 <= upper:
         raise ParameterError(
             f"minimum of the {name} is {lower} and its maximum {upper}; they must enclose zero, or "
-            "the body could not stand"
+            "the body cannot stop"
         )
     # Infinity times a time step of 0 would be NaN.
     return max(lower, -sys.float_info.max), min(upper, sys.float_info.max)
@@ -138,4 +138,4 @@ def _require_finite(v: float, v0: float = 0.0, dt: float = 0.0, v1: float = 0.0)
     if not (math.isfinite(v) and math.isfinite(v0) and math.isfinite(v1)):
         raise ParameterError(f"speeds {v}, {v0}, {v1} must be finite")
     if not 0.0 <= dt < math.inf:
-        raise ParameterError(f"dt is {dt} s: must be finite and not negative")
+        raise ParameterError(f"dt is {dt} s; it must be finite and not negative")

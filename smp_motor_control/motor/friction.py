@@ -99,7 +99,8 @@ class Motor:
         """
         if not (math.isfinite(voltage + load_torque) and 0.0 <= dt < math.inf):
             raise ParameterError(
-                f"cannot step by {dt!r} s under {voltage!r} V and {load_torque!r} N m"
+                f"cannot step by {dt!r} s under {voltage!r} V and {load_torque!r} N m; all must be "
+                "finite, the time not negative"
             )
         if self._coulomb == 0.0:
             if dt > 0:

@@ -212,9 +212,15 @@ class MotorPlant(Node):
             wheel.late = wheel.lease.late
         message = "simulating"
         if rejected:
-            message = f"refused non-finite messages: {', '.join(rejected)}"
+            message = (
+                f"messages with NaN or infinity were refused: {', '.join(rejected)}; look at their "
+                "publishers"
+            )
         elif late:
-            message = f"refused commands with late stamps: {', '.join(late)}"
+            message = (
+                f"commands older than {self._current.settings.drive.command_timeout:g} s were refused: "
+                f"{', '.join(late)}; look at the load and the clock of their writers"
+            )
         elif rivals:
             message = rivals
         return runtime.WARN if rejected or late or rivals else runtime.OK, message, values

@@ -69,7 +69,10 @@ class _Test:
             self.client.spin(SETTLING_TIME_S)
             first = len(seen)
             if first < 20:
-                raise RobotError(f"{self.wheel}: only {first} samples in {SETTLING_TIME_S} s")
+                raise RobotError(
+                    f"{self.wheel}: only {first} samples in {SETTLING_TIME_S} s, and 20 are needed"
+                    "; raise the rate of motor_state"
+                )
             late = [row[3] for row in seen if row[0] > seen[-1][0] - 0.5]
             self.centre = sum(late) / len(late)
             self.output = self.relay.bias + self.relay.amplitude

@@ -222,7 +222,8 @@ class RobotClient:
                 self._client(SetParametersAtomically, f"{node}/{SET}").service_is_ready, timeout
             ):
                 raise RobotError(
-                    f"{self._absolute_name(node)} does not answer within {timeout:.0f} s"
+                    f"{self._absolute_name(node)} does not answer within {timeout:.0f} s; is it "
+                    "running?"
                 )
 
     def wait_for_listener(self, node: str, topics: Sequence[str], timeout: float) -> None:

@@ -274,7 +274,9 @@ class SerialDriver(Node):
         if self._fd is None:
             return runtime.ERROR, f"{self._settings.device}: {self._problem}", values
         if now - self._heard_at > SILENCE_S:
-            return runtime.ERROR, "the board is silent", values
+            silence = now - self._heard_at
+            text = f"the board has been silent for {silence:.1f} s; check power, cable and baud"
+            return runtime.ERROR, text, values
         if self._supply < EMPTY_RATIO * self._settings.supply_voltage:
             found = (
                 f"the board reports a supply of {self._supply:g} V; is the battery switched off?"

@@ -248,7 +248,7 @@ class SkidSteerNode(Node):
                 f"{wheel} ({'never' if math.isinf(age) else f'{age:.1f} s'})"
                 for wheel, age in silent.items()
             )
-            problems.append((runtime.ERROR, f"no feedback from {wheels}"))
+            problems.append((runtime.ERROR, f"no feedback from {wheels}; check the wheels' driver"))
         for wheel, watch in self._states.items():
             if watch.has_two_publishers:
                 problems.append(
@@ -258,14 +258,19 @@ class SkidSteerNode(Node):
             problems.append((runtime.WARN, describe_two_publishers(self, "cmd_vel")))
         told = [f"{wheel}: {what}" for wheel, what in self._feedback.problems.items()]
         told += [
-            f"{wheel}: motor_state has no stamp" for wheel, no in self._unstamped.items() if no
+            f"{wheel}: motor_state has no stamp; its driver must set it"
+            for wheel, no in self._unstamped.items()
+            if no
         ]
         if told and not settings.open_loop:
             problems.append((runtime.WARN, "; ".join(told)))
         if now - self._refused_at < REPORT_TIME_S:
             problems.append((runtime.WARN, f"cmd_vel {self._refused}"))
         if self._unheard:
-            text = f"cmd_vel is also published as {self._unheard}, which is ignored"
+            text = (
+                f"cmd_vel is also published as {self._unheard}, which is ignored; stop one of the "
+                "publishers"
+            )
             problems.append((runtime.WARN, text))
         if commanded and self._command.timed_out(now) and any(self._past_commands[0]):
             problems.append((runtime.WARN, "cmd_vel timed out: braking"))

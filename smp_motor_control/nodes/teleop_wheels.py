@@ -135,7 +135,9 @@ class Settings:
     use_stamped_vel: bool = fixed(True, "Publish TwistStamped (true) or Twist (false).")
     frame_id: str = fixed("base_link", "Frame of a stamped command.")
 
-    wheel_names: tuple[str, ...] = fixed(WHEELS, "Wheels selected by the keys 1, 2, ...")
+    wheel_names: tuple[str, ...] = fixed(
+        WHEELS, "Wheels, in the order of the keys 1 to 9 that select them."
+    )
 
     def __post_init__(self) -> None:
         if not 1 <= len(self.wheel_names) <= 9:

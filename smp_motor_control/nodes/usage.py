@@ -4,9 +4,21 @@
 import contextlib
 import importlib
 import os
+import re
 import sys
 
 from smp_motor_control.fields import parameters_in
+
+
+def plain(text: str) -> str:
+    """Return a docstring without markup, such as ``motor_state`` or :class:`~wheel.Lease`.
+
+    Examples
+    --------
+    >>> plain("One step of :class:`~smp_motor_control.pid.Pid` for each ``motor_state``.")
+    'One step of Pid for each motor_state.'
+    """
+    return re.sub(r":\w+:`~?(?:[\w.]+\.)?(\w+)`", r"\1", text).replace("``", "")
 
 
 def main() -> int:
@@ -14,10 +26,10 @@ def main() -> int:
     module = importlib.import_module(sys.argv[1])
     name = sys.argv[1].rpartition(".")[2]
     usage = f"{name} [--ros-args [-r __ns:=/NAMESPACE] [-p NAME:=VALUE] [--params-file FILE]]"
-    lines = [f"usage: {usage}", "", (module.__doc__ or "").strip(), "", "parameters:"]
+    lines = [f"usage: {usage}", "", plain(module.__doc__ or "").strip(), "", "parameters:"]
     for parameter, entry in parameters_in(module.Settings).items():
         default = list(entry.default) if isinstance(entry.default, tuple) else entry.default
-        fixed = " (at the start only)" if entry.read_only else ""
+        fixed = " (fixed at start)" if entry.read_only else ""
         lines += [f"  {parameter} = {default!r}{fixed}", f"      {entry.text}"]
     with contextlib.suppress(BrokenPipeError):
         print("\n".join(lines), flush=True)

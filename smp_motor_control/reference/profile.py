@@ -77,7 +77,7 @@ class Profile:
     def set_target(self, velocity: float, sample_time: float = 0.005) -> None:
         """Start a transition from the present reference to a velocity."""
         if not math.isfinite(velocity):
-            raise ParameterError(f"target velocity is {velocity}: must be finite")
+            raise ParameterError(f"target velocity is {velocity}; it must be finite")
         most = min(self.limits.velocity, _MAX_TARGET)
         velocity = min(max(velocity, -most), most)
         if velocity == self.target:

@@ -52,9 +52,9 @@ class Fault(Enum):
     WRONG_WAY = (
         "runaway: the wheel turns against its set-point; check the signs of motor and encoder"
     )
-    NOT_FOLLOWING = "the wheel does not follow its set-point"
-    OVER_CURRENT = "over-current"
-    COMPUTATION = "the controller's computation fails with these parameters"
+    NOT_FOLLOWING = "the wheel does not follow its set-point; check load, supply and gains"
+    OVER_CURRENT = "over-current: the current exceeds current_limit; check for a blocked wheel"
+    COMPUTATION = "the controller cannot be computed with these parameters; correct them"
 
 
 @dataclass(frozen=True, kw_only=True)

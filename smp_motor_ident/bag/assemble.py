@@ -147,7 +147,7 @@ def _clock(motor: Motor) -> dict[str, Integers]:
         return {topic: table.logged for topic, table in tables.items()}
     stamps = {topic: _stamp(motor, table) for topic, table in tables.items()}
     if motor.plan.clock == "log":
-        motor.tell("time_base", "time: log times, as asked")
+        motor.tell("time_base", "time: log times, as clock=log requests")
         return {topic: table.logged for topic, table in tables.items()}
     judged = {t: clock.judge_stamps(stamps[t], table.logged) for t, table in tables.items()}
     poor = {topic: reason for topic, reason in judged.items() if reason}

@@ -93,7 +93,9 @@ def on_one_axis(motor: Motor, series: dict[str, Series], axis_name: str) -> Reco
         if name in series
     }
     if all(column is None for column in columns.values()):
-        raise BagError(f"{motor.where}: no output has a finite value")
+        raise BagError(
+            f"{motor.where}: no speed, position or count has a finite value; map another field"
+        )
     columns["voltage"] = values
     if not motor.plan.own:
         axis, columns, starts = _undo_delay(motor, axis, columns, starts)

@@ -85,8 +85,8 @@ def signed(size: Series, direction: Series, where: str) -> Series:
     if not 1 <= levels.size <= 3 or (levels.min() >= 0 and (levels > 0).sum() > 1):
         codes = ", ".join(f"{level:g}" for level in levels[:4]) + ", …" * (levels.size > 4)
         raise BagError(
-            f"{where}: direction has the values {codes}: which of them is backwards? Scale them "
-            "to signs: direction=COLUMN*-1+1.5 where 1 is forwards and 2 backwards"
+            f"{where}: direction has the values {codes}, and which is backwards is unknown. Scale "
+            "them to signs, such as direction=COLUMN*-1+1.5 for 1 forwards and 2 backwards"
         )
     sign = np.sign(direction.value)
     if levels.min() >= 0:  # 0 and 1

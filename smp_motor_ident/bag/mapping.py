@@ -258,7 +258,7 @@ def _signal(name: str, value: Any, place: str) -> Signal:
         signal = _written(str(value), place)
     constant = name == "voltage" and signal.offset != 0  # a constant level
     if not (signal.scale or constant) or not math.isfinite(signal.scale):
-        raise BagError(f"{place}: a scale of {signal.scale} leaves nothing of the signal")
+        raise BagError(f"{place}: its scale is {signal.scale}; it must be finite and not 0")
     if signal.shaft:
         _choice("shaft", signal.shaft, place)
     if signal.topic:

@@ -267,7 +267,9 @@ def _description(
         if table.log is not None and table.log.size:
             last = {name: float(column[-1]) for name, column in table.columns.items()}
             changed = [n for n, c in table.columns.items() if np.unique(c[c == c]).size > 1]
-            text = f"{topic}: {', '.join(changed)} changed meanwhile; the last is used"
+            text = (
+                f"{topic}: {', '.join(changed)} changed while recording; the last values are used"
+            )
             return last, [found("description_changed", text, "warning")] if changed else []
     if "gear_ratio" not in plan.hardware:
         own = any(signal.field == "encoder_count" for signal in plan.signals.values())

@@ -149,7 +149,9 @@ class Recording:
             try:
                 source = open_source(path, self._folder, self.budget)
                 if is_table(path) is not self.is_table:
-                    raise BagError(f"{path}: is of another kind than the other files")
+                    raise BagError(
+                        f"{path}: is not of the kind of the other files; give tables or bags"
+                    )
                 self._sources[path] = source
             except BagError as error:
                 if len(self.files) == 1 or self.is_table:
@@ -182,7 +184,7 @@ def recordings(paths: Any, topics: Collection[str] = ()) -> list[Recording]:
             raise BagError(f"{path}: holds no bag ({', '.join(BAGS)}) and no table such as .csv")
         every += inside
     if not every:
-        raise BagError("no bag is given")
+        raise BagError("no recording is given; name a file or a folder")
     return _join_by_columns(_join_topics(every, topics), topics)
 
 
@@ -207,7 +209,10 @@ def _join_topics(every: list[Recording], topics: Collection[str]) -> list[Record
         return every
     stems = [part.files[0].stem for part in parts]
     if len(set(stems)) < len(stems):
-        raise BagError(f"{parts[0].files[0]}: several files of that name are to be joined")
+        raise BagError(
+            f"{parts[0].files[0]}: several files have this name, by which the mapping tells "
+            "them apart; rename one"
+        )
     whole = Recording("+".join(stems), [part.files[0] for part in parts])
     return [whole, *(r for r in every if r not in parts and not r.is_table)]
 

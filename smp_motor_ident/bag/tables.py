@@ -142,7 +142,7 @@ def _time_signal(recording: Recording, plan: MotorMap, topic: str) -> Signal | N
         return replace(signal, unit=_unit("time", signal, channel, likely[0]))
     hint = f"time={likely[0]}" if likely else "time=COLUMN"
     raise BagError(
-        f"{recording.files[0]}: which column is the time? map {hint} or sample_time=SECONDS"
+        f"{recording.files[0]}: the column of time is unknown; map {hint} or sample_time=SECONDS"
     )
 
 
@@ -169,7 +169,10 @@ def apart(
             ]
             if len(set(filter(is_ros_name, own))) < len(own):
                 own = [f"motor_{re.sub('[.-]', '_', f'{n:g}')}" for n in numbers]
-            text = f"{recording.name}: {column} tells {len(own)} motors apart: {', '.join(own)}"
+            text = (
+                f"{recording.name}: {column} separates the rows of {len(own)} motors: "
+                f"{', '.join(own)}"
+            )
             finding = found("several_motors", text, motors=len(own))
             motors = [_rows(tables[topic], of == n, finding) for n in numbers]
             before = "" if wheel == DEFAULT_MOTOR else f"{wheel}_"
@@ -216,7 +219,7 @@ def timed(recording: Recording, plan: MotorMap, tables: Mapping[str, Table]) -> 
                 if not unit and signal.field not in of.exact:
                     _check_seconds(log, signal, recording)
                 if unit and unit != signal.unit:
-                    text = f"{recording.name}: {signal.field} is taken for {unit} since 1970"
+                    text = f"{recording.name}: {signal.field} is read as {unit} since 1970"
                     findings.append(found("time_unit", text))
         sound = log > clock.MISSING_TIME
         columns = table.columns
@@ -225,7 +228,9 @@ def timed(recording: Recording, plan: MotorMap, tables: Mapping[str, Table]) -> 
             findings.append(found("rows_without_time", text, "warning"))
             log, columns = log[sound], {name: c[sound] for name, c in columns.items()}
         if not log.size:
-            raise BagError(f"{recording.files[0]}: has no rows with a time from 1678 to 2262")
+            raise BagError(
+                f"{recording.files[0]}: has no row with a time from 1678 to 2262; correct its unit"
+            )
         if log.size > 2 and not np.ptp(log):
             raise BagError(
                 f"{recording.files[0]}: all {log.size} rows have the same time, "
@@ -242,8 +247,8 @@ def _check_seconds(log: Integers, signal: Signal, recording: Recording) -> None:
     step = float(np.median(steps)) if steps.size else 0.0
     if step >= limits.MAX_ROW_INTERVAL_S.value:
         raise BagError(
-            f"{recording.files[0]}: {signal.field} rises by {step:g} per row, too fast; "
-            f"tell its unit: time={signal.field}:ms (or us, ns; s where it is seconds)"
+            f"{recording.files[0]}: {signal.field} rises by {step:g} per row, too fast for "
+            f"seconds; give its unit: time={signal.field}:ms (or us, ns; s if it is seconds)"
         )
 
 

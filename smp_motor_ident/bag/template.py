@@ -100,7 +100,7 @@ class _Parser:
             self.take(1, 1)
         self.left -= 1
         if self.left < 0:
-            raise DecodeError("it has more parts than it can hold")
+            raise DecodeError("it claims more parts than its length can hold")
         return {key: self.value(description) for key, description in fields}
 
     def value(self, description: Any) -> Any:

@@ -340,7 +340,7 @@ def _checked(arguments: argparse.Namespace) -> Path:
             f"{folder}: exists already; choose another --output, or go on there with --resume"
         )
     if arguments.resume and protocol.NAME not in there:
-        raise ParameterError(f"{folder}: no commissioning was cut off there; leave out --resume")
+        raise ParameterError(f"{folder}: holds no interrupted commissioning; leave out --resume")
     return folder
 
 
@@ -354,7 +354,7 @@ def _confirm(
     if arguments.yes:
         return
     if not sys.stdin.isatty():
-        raise ParameterError("the wheels would move: say --yes, or run this in a terminal")
+        raise ParameterError("the wheels will move; confirm with --yes, or run this in a terminal")
     seconds = sum(one.excitation.duration for one in left)
     excited = f"for {seconds:.0f} s at up to {arguments.amplitude:g} V, then " if left else ""
     print(

@@ -138,7 +138,7 @@ def _results(paths: Sequence[str], settings: tuple[Any, ...], scheduler: str | N
                     tries[path] += 1
         for path in [p for p, n in tries.items() if n >= MAX_TRIES]:
             del tries[path]
-            why = f"{path}: its worker was ended, perhaps for its memory"
+            why = f"{path}: its worker was killed, perhaps for lack of memory"
             yield path, [_row(path, failure=why, lost=True)]
 
 
@@ -154,7 +154,9 @@ def on_cluster(paths: Sequence[str], settings: tuple[Any, ...], address: str) ->
     try:
         client = cast(Callable[..., Any], distributed.Client)(address, timeout="10s")
     except OSError as error:
-        raise ParameterError(f"--scheduler {address}: no answer ({error})") from None
+        raise ParameterError(
+            f"--scheduler {address}: no Dask scheduler answers ({error})"
+        ) from None
     with client:
         futures = {client.submit(identify_one, p, settings, pure=False): p for p in paths}
         for future in call(futures):

@@ -74,7 +74,9 @@ def work(arguments: argparse.Namespace) -> int:
     fixed = fixed_parameters(arguments.fix)
     if arguments.fleet:
         if loop is not None or arguments.validate:
-            raise ParameterError("--fleet goes without --controller and --validate")
+            raise ParameterError(
+                "--fleet excludes --controller and --validate; identify these recordings alone"
+            )
         from smp_motor_ident.cli import fleet
 
         return fleet.work(arguments, mapping, fixed)
@@ -110,7 +112,7 @@ def fixed_parameters(items: Sequence[str]) -> dict[str, float]:
     for name, value in fixed.items():
         if not 0 <= value < float("inf"):
             raise ParameterError(
-                f"--fix {name}={value:g}: must be zero or positive, in {UNITS[name]}"
+                f"--fix {name}={value:g}; it must be zero or positive, in {UNITS[name]}"
             )
     return fixed
 
@@ -297,7 +299,7 @@ def setpoint_map(arguments: argparse.Namespace) -> bag.SignalMap:
             "unit, and its measurement"
         )
     if any(re.search(r"(^|\s|\.)voltage=", item) for item in items):
-        raise ParameterError("--controller goes without voltage=: it computes the voltage")
+        raise ParameterError("--controller computes the voltage; leave out voltage=")
     mapping = bag.parse([_SETPOINT.sub(r"\1voltage=", item) for item in items], arguments.msg)
     motors = {}
     for wheel, plan in mapping.motors.items():
@@ -321,7 +323,7 @@ def reconstruction(arguments: argparse.Namespace) -> Reconstruct:
 
     name, *items = arguments.controller
     if name not in FORMATS:
-        raise ParameterError(f"--controller {name}: must be one of {', '.join(FORMATS)}")
+        raise ParameterError(f"--controller {name}; it must be one of {', '.join(FORMATS)}")
     loop = FORMATS[name].known
     if loop is None:
         raise ParameterError(f"--controller {name}: its arithmetic is not published; log the duty")

@@ -9,9 +9,10 @@ from smp_motor_ident.cli.frame import Parser, number, run
 NAME = "identify"
 
 DESCRIPTION = """\
-Identify the DC motors in one or more recordings, and write DIR/identification.json (results
-with their certainty), DIR/motors.yaml (a parameter file for motor_plant) and DIR/report.html
-(figures and explanations, in one file).
+Identify the DC motors in one or more recordings. Write DIR/identification.json (values with their
+uncertainty), DIR/motors.yaml (a parameter file for motor_plant) and DIR/report.html (charts and
+findings, in one file). Recordings are rosbag2 or ROS 1 bags, CSV, Excel, MATLAB, JSON and WPILib
+files with a voltage or PWM, and a speed, angle or encoder count.
 """
 EPILOG = """\
 examples:
@@ -22,10 +23,13 @@ examples:
            --map velocity=/joint_states.velocity[left_wheel_joint]
   identify log.csv --output result --map time=t voltage=u velocity=y:deg/s
 
-exit codes: 0 every wheel identified; 1 the data of some or all wheels do not support an answer,
-or an answer is unreliable and --accept-unreliable was not given (what could be identified is
-written; the message says what to record next); 2 wrong usage or unreadable input (nothing is
-written).
+--map takes [WHEEL.]SIGNAL=SOURCE[*SCALE][+OFFSET][:UNIT], with the signals voltage, velocity,
+position, count, current, supply, direction and time, and properties such as gear_ratio=30,
+counts_per_revolution=48, supply_voltage=12 and pwm_full_scale=255. docs/mapping.md lists all.
+
+exit codes: 0 every wheel identified; 1 the data of a wheel do not support an answer, or an answer
+is unreliable and --accept-unreliable was not given (the identifiable results are written; the
+message says what to record next); 2 wrong usage or unreadable input (nothing is written).
 """
 
 
@@ -38,29 +42,52 @@ def parser() -> Parser:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     add = made.add_argument
-    add("bags", nargs="+", metavar="BAG", help="bag, folder of bags, or CSV file")
+    add("bags", nargs="+", metavar="BAG", help="recording, or folder of recordings")
     add("--output", "-o", metavar="DIR", help="folder for the results")
     add("--force", action="store_true", help="replace existing results")
-    add("--validate", action="append", default=[], metavar="BAG", help="validate on this")
-    add("--wheel", action="append", default=[], metavar="NAME", help="only this wheel")
-    add("--model", default="auto", help="force a model instead of choosing one")
-    add("--fix", action="append", default=[], metavar="NAME=VALUE", help="known parameter, in SI")
-    add("--accept-unreliable", action="store_true", help="exit with 0 if values are unreliable")
-    add("--map", action="extend", nargs="+", default=[], metavar="KEY=VALUE", help="see below")
-    add("--mapping", metavar="FILE", help="mapping in a YAML file")
-    add("--msg", action="append", default=[], metavar="FILE", help=".msg file of an unknown type")
+    add("--validate", action="append", default=[], metavar="BAG",
+        help="recording that judges the fit and is not fitted; may be repeated")  # fmt: skip
+    add("--wheel", action="append", default=[], metavar="NAME",
+        help="identify only this wheel; may be repeated")  # fmt: skip
+    add("--model", default="auto",
+        help="first_order, second_order, electromechanical, or auto (default): the simplest "
+        "that explains the recording")  # fmt: skip
+    add("--fix", action="append", default=[], metavar="NAME=VALUE",
+        help="known parameter in SI, such as resistance=12.9; may be repeated")  # fmt: skip
+    add("--accept-unreliable", action="store_true", help="exit with 0 for unreliable values")
+    add("--map", action="extend", nargs="+", default=[], metavar="KEY=VALUE",
+        help="which column or topic is which signal; see below")  # fmt: skip
+    add("--mapping", metavar="FILE", help="the same in a YAML file")
+    add(
+        "--msg",
+        action="append",
+        default=[],
+        metavar="FILE",
+        help=".msg file of an unknown message type",
+    )
     add(
         "--controller", nargs="+", metavar=("FORMAT", "GAIN=VALUE"),
-        help="loop of a recording with set-points (--map setpoint=...) instead of voltages",
+        help="reconstruct the voltage from set-points (--map setpoint=...) of a known controller: "
+        "linorobot2, ros_arduino_bridge, arduino_pid, ros2_controllers or wpilib",
     )  # fmt: skip
-    add("--topics", action="store_true", help="list the bag's topics and suggest a mapping")
-    add("--fleet", action="store_true", help="identify each recording, compare in one table")
-    add("--scheduler", metavar="ADDRESS", help="with --fleet: Dask cluster to use")
-    add("--history", metavar="FILE", help="draw the history that identifier wrote")
+    add("--topics", action="store_true", help="list the signals and propose a mapping")
+    add(
+        "--fleet",
+        action="store_true",
+        help="identify each recording by itself and compare them in one table",
+    )
+    add("--scheduler", metavar="ADDRESS", help="with --fleet: address of a Dask scheduler")
+    add("--history", metavar="FILE", help="draw a history of the node identifier in the report")
     add("--tuning", action="store_true", help="add the tuning page to the report (takes longer)")
     add("--what-next", action="store_true", help="propose the next recording")
-    add("--accuracy", type=number(0, 1), default=0.01, help="target of --what-next; default 0.01")
-    add("--verbose", "-v", action="store_true", help="print all findings and notes")
+    add(
+        "--accuracy",
+        type=number(0, 1),
+        default=0.01,
+        metavar="SHARE",
+        help="relative accuracy that --what-next plans for; default 0.01",
+    )
+    add("--verbose", "-v", action="store_true", help="print all findings")
     add("--quiet", "-q", action="store_true", help="print errors only")
     return made
 

@@ -34,7 +34,7 @@ def connect(name: str, ros_arguments: Sequence[str] = ()) -> Any:
         from smp_motor_control.nodes.robot_client import RobotClient
     except ImportError as error:
         raise ParameterError(
-            f"a running robot needs ROS, and {error.name or error} is not there; source the "
+            f"a running robot needs ROS, and {error.name or error} is missing; source the "
             "workspace, or setup.bash of the repository"
         ) from None
     return RobotClient(ros_arguments, name)

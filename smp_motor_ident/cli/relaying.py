@@ -73,7 +73,10 @@ def evenly(answer: Mapping[str, Any]) -> tuple[list[tuple[Array, Array]], float]
     """Return a recorded oscillation on even grids, cut where too many samples were lost."""
     time = np.array(answer["time"])
     if time.size < 20:
-        raise DesignError(f"only {time.size} samples came while the relay switched")
+        raise DesignError(
+            f"only {time.size} samples came while the relay switched, and 20 are needed; raise the "
+            "rate of motor_state, or --relay-seconds"
+        )
     step = float(np.median(np.diff(time)))
     rising = np.flatnonzero(np.diff(np.sign(answer["voltage"])) > 0)
     cycle = float(np.median(np.diff(time[rising]))) if rising.size > 1 else np.inf

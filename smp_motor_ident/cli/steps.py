@@ -106,4 +106,4 @@ def _succeed(tool: str, code: int) -> None:
     if code == 130:
         raise KeyboardInterrupt
     if code != 0:
-        raise ProcessError(f"{tool} ended with exit code {code}, see above")
+        raise ProcessError(f"{tool} ended with exit code {code}; its messages are above")

@@ -17,41 +17,60 @@ FORMATS = (
 SPEED_SOURCES = ("measured", "difference", "observer")
 
 AIMS: dict[str, dict[str, Any]] = {
-    "phase_margin": dict(type=float, help="[deg], 60"),
-    "maximum_sensitivity": dict(type=float, help="Ms, 1.4"),
-    "focus": dict(choices=("balanced", "tracking", "load")),
-    "bandwidth": dict(type=float, help="crossover [rad/s]"),
-    "structure": dict(choices=("pi", "pid")),
-    "closed_loop_time_constant": dict(type=float, help="[s], of simc"),
-    "natural_frequency": dict(type=float, help="[rad/s], of pole_placement"),
-    "damping": dict(type=float, help="of pole_placement, 0.8"),
-    "max_velocity": dict(type=float, help="[rad/s, wheel]"),
-    "max_acceleration": dict(type=float, help="[rad/s^2, wheel]"),
-    "transition_time": dict(type=float, help="of a change of set-point [s]"),
-    "rule": dict(choices=("tyreus_luyben", "ziegler_nichols"), help="of --relay"),
+    "phase_margin": dict(
+        type=float, metavar="DEG", help="required phase margin; default of margin: 60"
+    ),
+    "maximum_sensitivity": dict(
+        type=float, metavar="MS", help="largest Ms; default of margin: 1.4"
+    ),
+    "focus": dict(
+        choices=("balanced", "tracking", "load"),
+        help="what the method margin favours: set-points, loads or both (default)",
+    ),
+    "bandwidth": dict(type=float, metavar="RAD/S", help="crossover frequency of the method margin"),
+    "structure": dict(choices=("pi", "pid"), help="default: the better one"),
+    "closed_loop_time_constant": dict(type=float, metavar="S", help="of the method simc"),
+    "natural_frequency": dict(
+        type=float, metavar="RAD/S", help="of the method pole_placement; default: the highest"
+    ),
+    "damping": dict(type=float, help="of the method pole_placement; default 0.8"),
+    "max_velocity": dict(type=float, metavar="RAD/S", help="limit of the set-point at the wheel"),
+    "max_acceleration": dict(
+        type=float, metavar="RAD/S2", help="limit of the reference at the wheel"
+    ),
+    "transition_time": dict(
+        type=float, metavar="S", help="duration of a change of set-point; default: the shortest"
+    ),
+    "rule": dict(choices=("tyreus_luyben", "ziegler_nichols"), help="rule of --relay"),
 }
 """Arguments for the targets of the design."""
 
 LOOP: dict[str, dict[str, Any]] = {
-    "rate": dict(type=float, help="steps per second [Hz]; else that of the bag"),
-    "delay": dict(type=float, help="measurement to voltage, beyond the hold [s]; else one sample"),
+    "rate": dict(type=float, metavar="HZ", help="steps per second"),
+    "delay": dict(
+        type=float, metavar="S",
+        help="longest delay from measurement to voltage, without the hold; default: one sample",
+    ),
     "bag": dict(
         type=Path,
-        help="measure both delays: a bag with motor_state and motor_command of the driving wheels",
+        help="measure both delays in a bag with motor_state and motor_command of driving wheels",
     ),
-    "usual_delay": dict(type=float, help="usual delay [s]; default: --delay"),
+    "usual_delay": dict(type=float, metavar="S", help="usual delay; default: --delay"),
     "speed_source": dict(
         choices=("auto", *SPEED_SOURCES), default="auto",
-        help="auto compares the gains that each allows",
+        help="default auto: the source that allows the largest gains",
     ),
-    "difference_window": dict(type=int, help="[samples]; else as identified"),
-    "speed_noise": dict(type=float, help="of the reported speed, standard deviation "
-                        "[rad/s, motor]; else as identified"),
-    "angle_noise": dict(type=float, help="of an angle (not counts) whose difference is the speed, "
-                        "standard deviation [rad, motor]; else as identified"),
-    "gear_ratio": dict(type=float, help="else as identified"),
-    "counts_per_revolution": dict(type=float, help="else as identified"),
-    "supply": dict(type=float, help="[V]; else as identified"),
+    "difference_window": dict(
+        type=int, metavar="SAMPLES", help="samples over which counts are differenced"
+    ),
+    "speed_noise": dict(type=float, metavar="RAD/S",
+                        help="standard deviation of the reported speed, at the motor shaft"),
+    "angle_noise": dict(type=float, metavar="RAD",
+                        help="standard deviation of an angle that is differenced, at the motor "
+                        "shaft"),
+    "gear_ratio": dict(type=float, help="motor revolutions per wheel revolution"),
+    "counts_per_revolution": dict(type=float, metavar="COUNTS", help="counts per motor revolution"),
+    "supply": dict(type=float, metavar="V", help="supply voltage"),
 }  # fmt: skip
 
 RUNNING: dict[str, dict[str, Any]] = {
@@ -59,44 +78,62 @@ RUNNING: dict[str, dict[str, Any]] = {
         action="store_true",
         help="set the gains in the running wheels, and restore the old ones if a loop misbehaves",
     ),
-    "gains": dict(type=Path, help="with --apply and without a source: gains of this file"),
-    "watch": dict(type=float, default=3.0, help="trial after --apply [s]"),
-    "relay": dict(metavar="WHEEL", help="tune by relay feedback, without a model"),
-    "relay_amplitude": dict(type=float, help="[V]; a quarter of the supply"),
-    "relay_hysteresis": dict(type=float, default=0.05, help="[rad/s, wheel]"),
-    "relay_seconds": dict(type=float, default=4.0),
+    "gains": dict(
+        type=Path, metavar="FILE", help="with --apply, instead of a source: parameter file to apply"
+    ),
+    "watch": dict(type=float, default=3.0, metavar="S", help="length of the trial; default 3"),
+    "relay": dict(metavar="WHEEL", help="tune this wheel by relay feedback, without a model"),
+    "relay_amplitude": dict(type=float, metavar="V", help="default: a quarter of the supply"),
+    "relay_hysteresis": dict(
+        type=float, default=0.05, metavar="RAD/S", help="at the wheel; default 0.05"
+    ),
+    "relay_seconds": dict(
+        type=float, default=4.0, metavar="S", help="length of the test; default 4"
+    ),
 }
-GROUPS = {"the loop": LOOP, "targets": AIMS, "running wheels": RUNNING}
+GROUPS = {
+    "the loop (default: as recorded or identified)": LOOP,
+    "targets": AIMS,
+    "running wheels": RUNNING,
+}
 
 TARGETS = (*AIMS, "relay_amplitude", "accept_unreliable")
 
 
 def parser() -> frame.Parser:
     """Return the parser of the tool's arguments."""
-    about = "Design gains that keep their margins on the loop that will run."
+    about = (
+        "Design the speed controllers of identified motors for the sampled loop that will run. "
+        "Write a parameter file for wheel_pid, or gains for another controller."
+    )
     p = frame.Parser(prog="tune", description=about, epilog=frame.OF_ROS)
     add = p.add_argument
     add("source", type=Path, nargs="?", help="identification.json, its folder, or motors.yaml")
     add(
         "--output",
         type=Path,
-        help="parameter file to write; gains.json and a figure go to the same folder",
+        metavar="FILE",
+        help="parameter file to write (.yaml); gains.json and a figure go to the same folder",
     )
     add(
         "--export", choices=FORMATS, metavar="FORMAT",
-        help="gains for a loop that others run, at its usual rate: " + ", ".join(FORMATS),
+        help="gains for another controller, at its usual rate: " + ", ".join(FORMATS),
     )  # fmt: skip
-    add("--method", default="margin", help=", ".join(METHODS))
-    add("--compare", action="store_true", help="show every method; take the recommended")
+    add("--method", default="margin", help=f"{', '.join(METHODS)}; default margin")
+    add(
+        "--compare",
+        action="store_true",
+        help="print the designs of all methods and use the recommended one",
+    )
     add(
         "--alone", action="store_true",
-        help="each wheel as fast as its own voltage allows, instead of all together",
+        help="plan each wheel as fast as its voltage allows, instead of all together",
     )  # fmt: skip
     add("--sets", choices=("auto", "one", "each"), default="auto",
-        help="one set of gains for all wheels, or one each")  # fmt: skip
+        help="one set of gains for all wheels, or one each; auto: one if it suffices")  # fmt: skip
     add(
         "--accept-unreliable", action="store_true", default=None,
-        help="design on an unreliable identification, with its full uncertainty",
+        help="design on an unreliable identification, with a larger uncertainty",
     )  # fmt: skip
     add("--force", action="store_true", help="replace existing files")
     for title, arguments in GROUPS.items():

@@ -173,7 +173,7 @@ def _export(arguments: argparse.Namespace) -> int:
     """Write or print gains for another loop."""
     target, output = FORMATS[arguments.export], arguments.output
     if arguments.apply or arguments.compare:
-        raise ParameterError("--export goes without --apply and --compare")
+        raise ParameterError("--export excludes --apply and --compare; leave one out")
     if output is not None:
         check_free([output], arguments.force)
     arguments.rate = arguments.rate or target.rate
@@ -196,7 +196,7 @@ def _export(arguments: argparse.Namespace) -> int:
 def _apply_file(arguments: argparse.Namespace) -> int:
     """Set the gains of a file unchanged."""
     if arguments.source is not None or arguments.output is not None or not arguments.apply:
-        raise ParameterError("--gains goes with --apply alone, without a source and --output")
+        raise ParameterError("--gains needs --apply; leave out source and --output")
     return applying.apply(applying.from_file(arguments.gains), arguments)
 
 

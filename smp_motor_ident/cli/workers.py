@@ -39,7 +39,10 @@ def in_parallel(
             say(f"{doing} {', '.join(left)}", len(done) / len(jobs))
         return {name: done[name] for name in jobs}
     except BrokenProcessPool:
-        raise BagError("a worker process was ended from outside, perhaps for its memory") from None
+        raise BagError(
+            "a worker process was killed, perhaps for lack of memory; free memory, or identify "
+            "fewer recordings at once"
+        ) from None
     finally:
         _JOBS.clear()
         for worker in multiprocessing.active_children():

@@ -19,9 +19,9 @@ class Demands:
 
     duration: float = described(5.0, "Minimum time in the window [s].")
     moving: float = described(3.0, "Minimum time of motion in the window [s].")
-    bins: int = described(8, "Number of levels that divide the range of voltages [1].")
-    filled: int = described(3, "Minimum number of levels with 2 % of the samples each [1].")
-    changes: int = described(6, "Minimum number of crossings of the mean voltage [1].")
+    bins: int = described(8, "Number of levels that divide the range of voltages.")
+    filled: int = described(3, "Minimum number of levels with 2 % of the samples each.")
+    changes: int = described(6, "Minimum number of crossings of the mean voltage.")
     both_directions: bool = described(
         True, "Whether the motor must have turned in both directions."
     )

@@ -1,15 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
-"""``identifier``: estimates the motors while they run.
+"""Estimates the motors while they run.
 
 Keeps a window of every wheel's ``motor_state``, estimates from it in a separate thread, and
 publishes ``MotorParameters``.  While a window lacks excitation (time, motion, levels and
-changes of voltage, both directions) the message has no numbers and its ``status`` begins with
-``collecting`` and lists the missing excitation; else it begins with ``valid``, or with
+changes of voltage, both directions), the message has no numbers, and its ``status`` begins with
+``collecting`` and lists the missing excitation. Otherwise it begins with ``valid``, or with
 ``unreliable`` or ``refused`` and the reason.
 
-With ``commissioned`` it also tracks resistance, motor constant and friction of identified motors,
-warns on ``/diagnostics`` when one has left its band, with the reason, and appends a line per wheel
-to ``history`` every minute, which ``identify --history`` draws.  It changes no gains.
+With ``commissioned`` it also tracks resistance, motor constant and friction of these motors, warns
+on ``/diagnostics`` when one has left its band, and appends a line per wheel and minute to
+``history``, which ``identify --history`` draws.  It changes no gains.
 """
 
 import math
@@ -59,12 +59,19 @@ class Settings:
         5.0, "Minimum interval between two estimates of a wheel [s].", minimum=0.5
     )
     share: float = described(
-        0.03, "Largest share of a processor for estimates in the long run [1].",
+        0.03, "Largest share of a processor for estimates in the long run.",
         minimum=1e-3, maximum=1.0,
     )  # fmt: skip
-    model: str = described("auto", "Model to fit; auto chooses the simplest adequate one.")
-    commissioned: str = fixed("", "identification.json, or its folder, of the motors to watch.")
-    history: str = fixed("", "File to which the history of the motors is appended.")
+    model: str = described(
+        "auto",
+        "Model: first_order, second_order, electromechanical, or auto (the simplest adequate one).",
+    )
+    commissioned: str = fixed(
+        "", "identification.json, or its folder, of the motors to watch; empty: none."
+    )
+    history: str = fixed(
+        "", "File to which the history of watched motors is appended; empty: none."
+    )
     demands: Demands = nested(Demands(), prefix="demands.")
 
     def __post_init__(self) -> None:

@@ -187,19 +187,32 @@ class Recorder(Node):
 def parser() -> argparse.ArgumentParser:
     made = argparse.ArgumentParser(
         prog="record",
-        description="Record topics into a bag (MCAP, readable by ros2 bag). Ctrl-C ends it; "
-        "a kill leaves a readable bag too.",
+        description="Record topics into a bag (MCAP, readable by ros2 bag). Ctrl-C ends it. The "
+        "bag stays readable if the process is killed.",
         epilog="Arguments for ROS follow --ros-args.",
     )
     add = made.add_argument
     add("topics", nargs="*", metavar="TOPIC", help="topics to record (default: all)")
     add("--output", "-o", metavar="DIR", help="folder of the bag (default: rosbag2_DATE)")
-    add("--all", "-a", action="store_true", help="all topics, which is the default")
-    add("--regex", "-e", default="", metavar="PATTERN", help="topics that match as a whole")
-    add("--exclude", "-x", default="", metavar="PATTERN", help="leave out what matches")
-    add("--include-hidden", action="store_true", help="also topics with a leading underscore")
-    add("--duration", "-d", type=float, default=0.0, metavar="S", help="end by itself")
-    add("--force", action="store_true", help="replace a bag that is there")
+    add("--all", "-a", action="store_true", help="record all topics (the default)")
+    add(
+        "--regex",
+        "-e",
+        default="",
+        metavar="PATTERN",
+        help="record topics whose whole name matches",
+    )
+    add("--exclude", "-x", default="", metavar="PATTERN", help="leave out topics that match")
+    add("--include-hidden", action="store_true", help="record topics with a leading underscore too")
+    add(
+        "--duration",
+        "-d",
+        type=float,
+        default=0.0,
+        metavar="S",
+        help="end after this time; default: at Ctrl-C",
+    )
+    add("--force", action="store_true", help="replace an existing bag")
     return made
 
 
@@ -208,7 +221,7 @@ def _make_room(path: Path, force: bool) -> None:
     if not path.exists():
         return
     if not force:
-        raise SmpError(f"{path} exists already; choose another name or say --force")
+        raise SmpError(f"{path} exists already; choose another --output or use --force")
     if not path.is_dir() or (any(path.iterdir()) and not (path / "metadata.yaml").exists()):
         raise SmpError(f"{path} is not a bag; --force replaces bags only")
     shutil.rmtree(path)

@@ -113,8 +113,13 @@ def _cut_at_lost_sample(record: Record, T: float) -> Record:
     end = min([len(record), *record.starts[1:], *(lost[:1] + 1)])
     if end < len(record):
         if end < 2:
-            raise SignalError(f"{record.source}: {record.wheel}: lost its second sample")
-        text = f"the loop is known only up to a lost sample at {record.time[end - 1]:.4g} s"
+            raise SignalError(
+                f"{record.source}: {record.wheel}: the second sample is missing, so the "
+                "commands are unknown; log every step"
+            )
+        text = (
+            f"a sample is missing at {record.time[end - 1]:.4g} s; the recording is used up to it"
+        )
         note = Finding("lost_loop", "warning", text, {"samples": float(end)})
         record = record.slice(0, int(end))
         record = replace(record, findings=(*record.findings, note))

@@ -174,8 +174,8 @@ def plan_reference(
             raise DesignError(
                 f"max_acceleration {rate / ratio:.4g} rad/s^2 is beyond the motor: a "
                 f"change by {plan.max_velocity / ratio:.3g} rad/s within {PEAK_VOLTAGE_SHARE:.0%} "
-                f"of {loop.supply_voltage:g} V reaches {steepest / ratio:.4g} rad/s^2; ask for that "
-                "or less"
+                f"of {loop.supply_voltage:g} V reaches {steepest / ratio:.4g} rad/s^2; ask for "
+                "that or less"
             )
         plan = replace(plan, max_acceleration=rate)
     if duration is not None:
@@ -198,7 +198,8 @@ def _reachable(plant: Plant, loop: Loop, wished: float | None) -> float:
     if wished is not None and wished > top:
         raise DesignError(
             f"max_velocity {wished / ratio:.4g} rad/s is beyond the motor: "
-            f"{STEADY_VOLTAGE_SHARE:.0%} of {loop.supply_voltage:g} V reaches {top / ratio:.4g} rad/s; ask for that or less"
+            f"{STEADY_VOLTAGE_SHARE:.0%} of {loop.supply_voltage:g} V reaches "
+            f"{top / ratio:.4g} rad/s; ask for that or less"
         )
     return 0.9 * top if wished is None else wished
 

@@ -305,7 +305,7 @@ def disturbed(silence: float) -> list[Finding]:
     if silence <= MAX_SILENCE.value:
         return []
     evidence = {"silence": silence, "limit": MAX_SILENCE.value}
-    text = f"a wheel received no command for {silence:.2f} s"
+    text = f"a wheel received no command for {silence:.2f} s, so the drive does not test the gains"
     return [Finding("verification_disturbed", "refused", text, evidence, _TIME)]
 
 

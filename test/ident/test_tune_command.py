@@ -191,7 +191,7 @@ def test_nothing_is_overwritten_without_force(identified, capsys):
         (["--gear-ratio", "0"], 2, "gear_ratio is 0"),
         (["--output", "gains.txt"], 2, "must end in .yaml"),
         (["--colour", "red"], 2, "unrecognized arguments"),
-        (["--gains", "x.yaml"], 2, "--gains goes with --apply alone"),
+        (["--gains", "x.yaml"], 2, "--gains needs --apply"),
     ],
 )
 def test_refusal_is_one_line_with_its_exit_code(identified, capsys, arguments, code, words):

@@ -98,7 +98,7 @@ class ColumnFile(Tables):
         super().__init__(path, name)
         self.problems += problems
         if not columns:
-            raise BagError(f"{name}: holds no column of numbers")
+            raise BagError(f"{name}: holds no column of numbers; give a table of samples")
         check_width(len(columns), name)
         self._columns = columns
         self._units = units or {}

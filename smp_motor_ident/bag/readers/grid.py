@@ -57,7 +57,7 @@ def head(rows: Sequence[Row], where: str) -> Grid:
     data = [*map(is_data, seen), True]
     first = next((k for k in range(len(seen)) if data[k] and data[k + 1]), None)
     if first is None:
-        raise BagError(f"{where}: has no rows of numbers")
+        raise BagError(f"{where}: has no rows of numbers; give a table of samples")
     width = len(seen[first])
     check_width(width, where)
     above = [row for row in seen[:first] if sum(not _empty(c) for c in row) > width / 2]

@@ -179,10 +179,10 @@ def _sysid(
         table = np.array([row for row in rows if len(row) == width], np.float64)
         factor = float(document.get("unitsPerRotation") or 1.0)
     except (TypeError, ValueError, OverflowError):
-        raise BagError(f"{name}: its tests hold something else than rows of numbers") from None
+        raise BagError(f"{name}: its tests do not hold rows of numbers") from None
     if not table.size or not form or not 0 < factor < np.inf:
         widths = ", ".join(sorted({str(width) for _, width in _FORMS}))
-        raise BagError(f"{name}: its tests hold no rows of {widths} numbers, or no sound units")
+        raise BagError(f"{name}: its tests hold no rows of {widths} numbers, or no valid units")
     table = table[np.argsort(table[:, 0], kind="stable")]
     columns = {key: table[:, k] for k, key in enumerate(form)}
     if str(document.get("test", "Drivetrain")) in _ONE_MOTOR and "left_voltage" in columns:

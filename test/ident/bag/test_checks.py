@@ -138,7 +138,7 @@ def test_codes_of_a_direction_that_are_no_signs_are_questioned(tmp_path: Path, s
     direction = np.select([volts > 0, volts < 0], [1, 2], 0)
     path = write(tmp_path / "log.csv", t=T, u=np.abs(volts), dir=direction, y=motion())
     mapping = "voltage=u velocity=y time=t direction=dir"
-    with pytest.raises(BagError, match="1, 2: which of them is backwards"):
+    with pytest.raises(BagError, match="1, 2, and which is backwards is unknown"):
         read_records(path, [mapping])
     record = read_records(path, [f"{mapping}*-1+1.5"])["motor"]
     np.testing.assert_allclose(record.voltage[1:], volts[:-1], rtol=1e-12)

@@ -327,7 +327,7 @@ def test_a_column_goes_by_its_name_without_the_unit(tmp_path: Path) -> None:
         ("t,u,y\n", MAP, "no rows"),
         ("t,u,y\n0,1,2\n1,1,abc\n", MAP, "line 3, column 'y': 'abc' is not a number"),
         (table(), ["voltage=u velocity=speed time=t"], "no column 'speed'; it has t, u, y"),
-        (table(), ["voltage=u velocity=y"], "which column is the time"),
+        (table(), ["voltage=u velocity=y"], "the column of time is unknown"),
         (table(), None, "needs a mapping, such as"),
         ("t,u,y\n0,1,2\n", MAP, "fewer than 2"),
         ("\x00\xff\xfe", MAP, "log.csv"),

@@ -86,7 +86,7 @@ def test_the_same_is_written_in_yaml_and_on_the_command_line(tmp_path: Path) -> 
         ("volts=/a.b", "not a key of a mapping; use voltage"),
         ("left.volts=/a.b", "not a key of a mapping"),
         ("voltage=/a.b:furlong", "cannot be in 'furlong'; use one of V"),
-        ("velocity=/a.b*0", "leaves nothing"),
+        ("velocity=/a.b*0", "its scale is 0"),
         ("velocity=/a.b*1/0", "divides by zero"),
         ("velocity=/a.b@axle", "'axle'; use wheel or motor"),
         ("velocity=/a.b[c", "field path"),

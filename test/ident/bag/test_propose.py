@@ -247,7 +247,7 @@ def test_a_size_is_proposed_with_its_direction(tmp_path: Path) -> None:
     columns["dir"] = np.where(voltage > 0, 1, 2)
     listing = list_topics(write(tmp_path / "log.csv", **columns))[0]
     assert listing.suggestion == []
-    assert "which of them is backwards" in listing.remark
+    assert "which is backwards is unknown" in listing.remark
     columns["w"] = np.abs(speed)
     listing = list_topics(write(tmp_path / "log.csv", **columns))[0]
     assert listing.suggestion == ["voltage=u", "velocity=w", "time=t"]
