@@ -8,10 +8,14 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
 CALLS = {"Finding", "found", "tell", "_amiss", "warning", "error", "info", "refuse"}
+STATES = {"State", "Fault"}
+"""Enumerations whose values are messages."""
+TELLS = re.compile("_?(describe|report|problem|wrong|assess|name_cause)")
+"""Functions that return a message."""
 HEAD = """# Messages
 
-Messages of tools and nodes by package, printed by `python scripts/messages.py`. N is a number and
-… a word; the advice of a finding has its own line.
+Messages of tools and nodes by package, printed by `python scripts/messages.py`. `N` stands for a
+number, `…` for a word. The advice of a finding has a line of its own.
 """
 
 
@@ -32,8 +36,16 @@ def read_messages(path: Path) -> Iterator[str]:
         if isinstance(node, ast.Call):
             name = ast.unparse(node.func).rpartition(".")[2]
             texts = node.args if name in CALLS or name.endswith("Error") else []
-        elif isinstance(node, ast.Assign) and ast.unparse(node.targets[0]) in ("text", "message"):
-            texts = [node.value]
+        elif isinstance(node, ast.Assign):
+            name = ast.unparse(node.targets[0])
+            told = name in ("text", "message", "advice") or name.endswith("_TEXT")
+            texts = [node.value] if told else []
+        elif isinstance(node, ast.ClassDef) and node.name in STATES:
+            texts = [one.value for one in node.body if isinstance(one, ast.Assign)]
+        elif isinstance(node, ast.FunctionDef) and TELLS.match(node.name):
+            for part in ast.walk(node):
+                if isinstance(part, ast.Return) and part.value is not None:
+                    texts += part.value.elts if isinstance(part.value, ast.Tuple) else [part.value]
         for text in map(read_text, texts):
             if len(re.findall(r"[a-z]{2,}", text)) > 2 and " " in text:
                 yield " ".join(text.split())

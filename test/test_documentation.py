@@ -288,9 +288,9 @@ def test_the_driver_of_the_page_publishes_counts_and_applies_commands():
         node = names["Driver"](board)
         published = []
         node.states = SimpleNamespace(publish=published.append)
-        node.sample()
-        node.obey(names["MotorCommand"](voltage=3.0))
-        node.sample()
+        node.on_timer()
+        node.on_command(names["MotorCommand"](voltage=3.0))
+        node.on_timer()
         node.destroy_node()
     finally:
         rclpy.try_shutdown()

@@ -212,14 +212,13 @@ class MotorPlant(Node):
             wheel.late = wheel.lease.late
         message = "simulating"
         if rejected:
-            message = (
-                f"messages with NaN or infinity were refused: {', '.join(rejected)}; look at their "
-                "publishers"
-            )
+            names = ", ".join(rejected)
+            message = f"refused non-finite messages: {names}; look at their publishers"
         elif late:
+            oldest = self._wheels[0].motor.settings.command_timeout
             message = (
-                f"commands older than {self._current.settings.drive.command_timeout:g} s were refused: "
-                f"{', '.join(late)}; look at the load and the clock of their writers"
+                f"refused commands older than {oldest:g} s: {', '.join(late)}; look at the load and "
+                "the clock of their writers"
             )
         elif rivals:
             message = rivals

@@ -19,24 +19,28 @@ EXPLAINED: Mapping[str, tuple[str, str, str]] = {
     "coulomb_friction_reverse": ("Tc−", "Coulomb friction, reverse", "turning backwards"),
     "delay": ("τd", "Delay", "from voltage to speed, sensor filters included"),
     "dc_gain": ("k", "DC gain", "steady motor speed per volt beyond the static voltage"),
-    "time_constant": ("τ", "Time constant", "how slowly the speed follows, all lags together"),
+    "time_constant": ("τ", "Time constant", "sum of the lags from voltage to speed"),
     "time_constant_product": ("τ₁τ₂", "Lag product", "of the two time constants"),
-    "static_voltage": ("v0", "Static voltage", "needed to keep the motor barely turning"),
+    "static_voltage": ("v0", "Static voltage", "voltage that overcomes Coulomb friction"),
     "static_voltage_reverse": ("v0−", "Static voltage, reverse", "turning backwards"),
     "steady_speed": ("ω∞", "Steady speed", "at the one voltage that was recorded"),
-    "load_voltage": ("vl", "Load voltage", "offset that a constant load or sensor makes"),
+    "load_voltage": ("vl", "Load voltage", "voltage that a constant load takes"),
     "averaging_window": ("w", "Averaging window", "over which the sensor averages the speed"),
     "sensor_lag": ("τs", "Sensor lag", "of the speed's low-pass"),
-    "dead_zone": ("vd", "Dead zone", "command below which the driver puts out nothing"),
-    "least_command": ("vm", "Least command", "below which the driver puts out nothing"),
-    "clip_voltage": ("vc", "Clip voltage", "the most that the driver puts out"),
-    "slew_rate": ("dv/dt", "Slew rate", "how fast the driver's voltage rises"),
+    "dead_zone": ("vd", "Dead zone", "voltage that the driver subtracts from every command"),
+    "least_command": ("vm", "Least command", "size below which the driver ignores a command"),
+    "clip_voltage": ("vc", "Clip voltage", "largest voltage of the driver"),
+    "slew_rate": ("dv/dt", "Slew rate", "largest rate of the driver's voltage"),
     "source_resistance_ratio": ("ρ", "Source resistance", "of the supply, over the armature's"),
     "brush_drop": ("vb", "Brush drop", "over brushes or transistors, whatever the current"),
-    "quadratic_drag": ("c", "Quadratic drag", "voltage that it takes, over back-EMF squared"),
+    "quadratic_drag": (
+        "c",
+        "Quadratic drag",
+        "voltage of the drag over the square of the back-EMF",
+    ),
     "current_limit_voltage": ("vi", "Current limit", "of the driver, times the resistance"),
     "fast_decay_ratio": ("τₑf", "Fast-decay ratio", "electrical time constant in PWM periods"),
-    "coasting_share": ("s₀", "Coasting share", "of back-EMF in the voltage at steady speed"),
+    "coasting_share": ("s₀", "Coasting share", "share of back-EMF in the voltage at steady speed"),
     "current_lag": ("τi", "Current lag", "mean lag of the current sensor"),
     "encoder_error": ("e", "Encoder error", "amplitude of its error once a turn"),
 }
@@ -49,6 +53,18 @@ MODELS: Mapping[str, str] = {
     "electromechanical": "electromechanical: winding, rotor and friction",
 }
 
+
+CAUSES: Mapping[str, str] = {
+    "averaged_current": "current averaging",
+    "averaged_speed": "speed averaging",
+    "coast": "fast decay",
+    "low_passed_current": "current low-pass",
+    "low_passed_speed": "speed low-pass",
+    "slew": "slew limit",
+    "smoothed_current": "current smoothing",
+    "stribeck": "Stribeck",
+}
+"""Causes of systematic uncertainty whose codes are not the words for them."""
 
 SCALES = {"s": ("ms", 1e3), "s^2": ("ms^2", 1e6), "H": ("mH", 1e3), "N m": ("mN m", 1e3)}
 """Display units for small values, and their factors."""
@@ -176,6 +192,7 @@ def systematic(quantity: Quantity) -> str:
 
     Examples
     --------
+    >>> from smp_motor_ident.result import Share
     >>> systematic(Quantity(12.9, 0.02, systematic=(Share("current_scale", 0.03, 0.39),)))
     '± 3 % (current scale)'
     """
@@ -188,11 +205,22 @@ def systematic(quantity: Quantity) -> str:
             if one.share is not None
             else _with_unit(spread(one.size), shown.unit)
         )
-        + f" ({one.cause.replace('_', ' ')})"
+        + f" ({cause(one.cause)})"
         for one in shown.systematic
     ]
     volts = (quantity.valid or {}).get("voltage")
     return ", ".join([*words, *([f"seen at ±{volts[1]:.3g} V only"] if volts else [])])
+
+
+def cause(name: str) -> str:
+    """Return a cause of systematic uncertainty in words.
+
+    Examples
+    --------
+    >>> cause("low_passed_speed"), cause("load_step")
+    ('speed low-pass', 'load step')
+    """
+    return CAUSES.get(name, name.replace("_", " "))
 
 
 def typeset(unit: str) -> str:

@@ -54,7 +54,7 @@ class Case:
     method: Method  # the method that was asked for
     problem: Problem  # the nominal motor and the targets
     required: RequiredMargins  # margins that the gains must keep
-    ensemble: UncertaintyEnsemble  # the motors that the data allow
+    ensemble: UncertaintyEnsemble  # motors within the uncertainty
     drawn: bool  # whether these were drawn; else the ensemble is the nominal motor alone
     friction: Friction  # range of the dry friction
     driver: Driver  # effects of its driver
@@ -172,8 +172,9 @@ def solve(case: Case) -> tuple[Feedback, float, Robustness]:
     if factor == 0.0:
         raise DesignError(
             f"{case.wheel}: no gains of this kind keep a phase margin of "
-            f"{case.required.phase:g} deg and Ms {case.required.sensitivity:g} over the motors "
-            f"that the data allow (only {robustness.holds:.0%} do)"
+            f"{case.required.phase:g} deg and Ms {case.required.sensitivity:g} for 99 % of the "
+            f"motors "
+            f"within the uncertainty (for {100 * robustness.holds:.0f} %)"
             f"{words(case.problem.unmodelled)}; record more, or ask for smaller margins"
         )
     return feedback, factor, robustness

@@ -262,18 +262,19 @@ def _explain(
     findings = list(case.findings)
     if case.drawn:
         words.append(
-            f"{robustness.holds:.1%} of {robustness.samples} motors that the data allow keep the "
-            f"required margins, {robustness.stable:.1%} are stable"
+            f"{100 * robustness.holds:.1f} % of {robustness.samples} motors within the uncertainty "
+            f"keep the required margins, {100 * robustness.stable:.1f} % are stable"
         )
     if factor < 1:
         words.append(
-            f"gains backed off to {factor:.0%} of the rule's so that 99 % hold and the control "
-            "noise stays within the clamp"
+            f"gains reduced to {100 * factor:.0f} % of the rule's, so that 99 % of these motors "
+            f"keep "
+            "the margins and the control noise stays within the clamp"
         )
     unmodelled = case.problem.unmodelled
     if unmodelled is not None:
         words.append(
-            f"unmodelled dynamics reach {robustness.unmodelled:.0%} of the loop's bound"
+            f"unmodelled dynamics reach {100 * robustness.unmodelled:.0f} % of the loop's bound"
             + known_words(unmodelled, ": ")
         )
         # Beyond the crossover |T| is as large as the gains: so much of it the rule's had.
@@ -281,14 +282,14 @@ def _explain(
             findings.append(_report_limited_gains(unmodelled))
     if figures.control_noise > 1.05 * loop.noise_limit:
         noisy = (
-            f"the measurement makes {figures.control_noise:.2g} V of control noise, above "
-            f"{loop.noise_limit:.2g} V"
+            f"measurement noise causes {figures.control_noise:.2g} V of control noise, and "
+            f"{loop.noise_limit:.2g} V are desired: the motor gets warmer and louder"
         )
         findings.append(Finding("control_noise", "warning", noisy))
     if math.isnan(bands.settling.high):
         open_end = (
-            "some of the motors that the data allow do not settle within 2 % of a change of "
-            "set-point: no largest settling time is stated"
+            "some motors within the uncertainty do not settle within 2 % of a change of set-point, "
+            "so no largest settling time is stated"
         )
         findings.append(Finding("settling_unknown", "warning", open_end))
     return "; ".join(words), tuple(findings)

@@ -11,35 +11,37 @@ from smp_motor_ident.limits import Limit
 MAX_FRICTION_ERROR = Limit(
     0.02,
     "share of the supply",
-    "an error of the friction's feed-forward by this changes the speed by as much of its largest "
-    "value as the band in which a change counts as settled",
+    "such an error of the feed-forward changes the speed by 2 % of its largest value, the band in "
+    "which a change counts as settled",
     "test_tune_truth.py",
 )
 MAX_FRICTION_RANGE = Limit(
     0.5,
     "share of the supply",
-    "with half of the supply unknown the speed that the motor reaches is not known to a factor 2",
+    "if friction may take half of the supply, the reachable speed is uncertain by a factor of two",
     "test_tune_truth.py",
 )
 MIN_UNRELIABLE_STD = Limit(
     0.1,
     "relative standard deviation",
-    "least that numbers of an unreliable estimate are drawn with; more where the fit on held-out "
-    "data leaves more of the motion unexplained",
+    "assumed for every number of an unreliable estimate; more where the fit of held-out data "
+    "leaves "
+    "more of the motion unexplained",
     "test_tune_truth.py",
 )
 MAX_STATED_GAIN_MARGIN = Limit(
     10.0,
     "times the gain",
-    "physical: a gain ten times as large crosses one where half a row of delay or of a sensor's "
-    "window, which no record excludes, turns the phase by tens of degrees",
+    "physical: with ten times the gain, half a row of delay or averaging, which no record "
+    "excludes, "
+    "shifts the phase at crossover by tens of degrees",
     "test_tune_truth.py",
 )
 MAX_SPEED_NOISE = Limit(
     2.5e-3,
     "share of the top speed, rms",
-    "four times this is 2 % of half the top speed: with more, counts shake the wheel out of the "
-    "band in which the specification calls a change settled",
+    "four standard deviations are then 2 % of half the top speed; more noise would leave the band "
+    "in which a change counts as settled",
     "test_tune_methods.py",
 )
 MIN_OUTLIER_DEVIATIONS = Limit(
@@ -66,13 +68,13 @@ RESONANCE_ERROR = Limit(
 MAX_RESONANCE_DAMPING = Limit(
     0.5,
     "damping ratio",
-    "physical: the largest of a shaft; with more, a step causes one swing of 16 % at most",
+    "physical: the largest of a shaft; with more, a step overshoots once, by at most 16 %",
     "test_tune_unmodelled.py: the effect of a resonance equals that of a simulated one",
 )
 MIN_LIMITING_SHARE = Limit(
     0.97,
     "of the tolerated unmodelled dynamics",
-    "the step by which gains are reduced: below it another limit holds, and a richer recording "
+    "one step of the reduction of gains; below it another limit is active, and a richer recording "
     "would not help",
     "test_tune_unmodelled.py: the loop stays within the excited band",
 )
@@ -86,8 +88,8 @@ MAX_DELAY_SHARE = Limit(
 MAX_SETTLING_LOSS = Limit(
     0.1,
     "of a settling time",
-    "cost: a driver does not notice a tenth more settling time, but does notice several times the "
-    "overshoot",
+    "cost: users notice several times the overshoot, but not a settling time that is a tenth "
+    "longer",
     "test_tune_truth.py",
 )
 
@@ -101,13 +103,13 @@ MAX_COMMAND_ERROR = Limit(
 LOOP_RATE_TOLERANCE = Limit(
     0.02,
     "of the interval",
-    "clocks of boards are within 2 %; a log at another rate leaves commands out",
+    "clocks of boards are within 2 %; a larger difference means that the log omits steps",
     "test_known_loop.py: unknown commands are refused",
 )
 TICK_TOLERANCE = Limit(
     0.05,
     "of a tick",
-    "digits that put 95 % of speeds within a twentieth of a whole tick leave no doubt which",
+    "if 95 % of the speeds are this close to whole ticks, the number of ticks is certain",
     "test_known_loop.py: the command is reconstructed",
 )
 
@@ -121,7 +123,7 @@ SETTLING_BAND = Limit(
 MAX_PLANNED_OVERSHOOT = Limit(
     0.01,
     "of a change of set-point",
-    "the largest planned overshoot of the reference: a load or a count may use it up",
+    "the largest planned overshoot of the reference; a load or a count may cause as much",
     "test_verification.py: a wheel that does as designed",
 )
 MAX_SILENCE = Limit(
@@ -133,7 +135,7 @@ MAX_SILENCE = Limit(
 MAX_STEADY_ERROR = Limit(
     0.02,
     "of a change of set-point",
-    "the same band: integral action leaves no error but the unsettled rest",
+    "the same band: integral action leaves only the error that has not settled",
     "test_verification.py: a speed that stays off",
 )
 DRIVE_LEVEL = Limit(

@@ -84,7 +84,7 @@ class Settling:
     """Settling of a change of set-point from rest, with the parts that the figure includes."""
 
     value: float  # of the motor as identified [s]
-    high: float  # 99 % of the motors that the data allow [s]
+    high: float  # of 99 % of the motors within the uncertainty [s]
     tolerance: float  # band around the set-point [share of the change]
     change: float  # of the set-point [rad/s, wheel]
     transition: float  # duration of the planned change, which is in the figures [s]

@@ -161,7 +161,10 @@ def _choose(
         return None, "one set of gains each: no set keeps the margins on all wheels"
     if sets == "auto" and best[0] > MAX_REJECTION_LOSS:
         return None, (
-            f"one set of gains each: a set that holds for all would let a load pull a wheel down "
-            f"{best[0]:.2f} times as far"
+            f"one set of gains each: with a common set a load would slow a wheel {best[0]:.2f} "
+            f"times "
+            "as much"
         )
-    return best[1], f"one set of gains for all: no wheel loses more than {best[0] - 1:.0%} by it"
+    return best[
+        1
+    ], f"one set of gains for all: a load slows no wheel by over {100 * (best[0] - 1):.0f} % more"

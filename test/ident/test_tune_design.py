@@ -94,8 +94,8 @@ def test_gains_hold_for_99_percent_of_an_uncertain_motor(method):
 def test_uncertainty_makes_the_design_back_off_and_say_so():
     sure, unsure = design(estimate(1), Loop()), design(estimate(1, std=0.15), Loop())
     assert unsure.gains.i < sure.gains.i
-    assert "backed off to" in unsure.reason
-    assert "backed off" not in sure.reason
+    assert "gains reduced to" in unsure.reason
+    assert "gains reduced" not in sure.reason
     assert any("no uncertainty" in warning for warning in sure.warnings)
 
 
