@@ -45,9 +45,11 @@ _GOOD_TRACKING_SHARE = 0.1
 class Fault(Enum):
     """Faults of a driven wheel."""
 
-    STALL = "no counts under voltage: stalled wheel or, less likely, dead encoder"
-    DEAD_ENCODER = "no counts under voltage: dead encoder or, less likely, stalled wheel"
-    NO_MOTION = "no counts under voltage: stalled wheel or dead encoder"
+    STALL = "no counts under voltage: stalled wheel or, less likely, dead encoder; check both"
+    DEAD_ENCODER = (
+        "no counts under voltage: dead encoder or, less likely, stalled wheel; check both"
+    )
+    NO_MOTION = "no counts under voltage: stalled wheel or dead encoder; check both"
     RUNAWAY = "runaway: the wheel turns against its voltage; check the signs of motor and encoder"
     WRONG_WAY = (
         "runaway: the wheel turns against its set-point; check the signs of motor and encoder"
