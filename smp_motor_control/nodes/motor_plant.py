@@ -217,8 +217,8 @@ class MotorPlant(Node):
         elif late:
             oldest = self._wheels[0].motor.settings.command_timeout
             message = (
-                f"refused commands older than {oldest:g} s: {', '.join(late)}; look at the load and "
-                "the clock of their writers"
+                f"refused commands older than {oldest:g} s: {', '.join(late)}; look at the load "
+                "and the clock of their writers"
             )
         elif rivals:
             message = rivals

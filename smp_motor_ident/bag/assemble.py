@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from smp_motor_control.arrays import Array, Integers
 from smp_motor_control.motor.parameters import Gearbox
 from smp_motor_ident.bag import checks, clock, counter, mapping, units
-from smp_motor_ident.bag.axis import Motor, Series, finite, on_one_axis, unwrapped
+from smp_motor_ident.bag.axis import Motor, Series, resample_to_output, select_finite, unwrap_counts
 from smp_motor_ident.bag.limits import MAX_COUNT_STEP
 from smp_motor_ident.bag.storage import Table
 from smp_motor_ident.errors import BagError
@@ -36,7 +36,7 @@ def assemble(
         raise BagError(f"{motor.where}: the mapping gives no {missing}")
     clocks = _clock(motor)
     arrivals = [topic for topic, time in clocks.items() if time is tables[topic].log]
-    times, leaps = clock.without_leaps(clocks, plan.gap)
+    times, leaps = clock.remove_leaps(clocks, plan.gap)
     if leaps:
         text = (
             f"the time leaps by up to {_span(max(leaps))} in {len(leaps)} places: the clock was "
@@ -54,11 +54,11 @@ def assemble(
     if together:
         _drop_incomplete_samples(motor, series, axis_name)
     elif axis_name == "count":  # a whole number has no NaN
-        series["count"] = finite(series["count"])
+        series["count"] = select_finite(series["count"])
     _check(motor, series)
     if together:
         _drop_incomplete_samples(motor, series, axis_name)
-    return on_one_axis(motor, series, axis_name)
+    return resample_to_output(motor, series, axis_name)
 
 
 def _span(seconds: float) -> str:
@@ -81,7 +81,7 @@ def _fit_arrivals(motor: Motor, topic: str, time: Integers) -> Integers:
     if table.clocked and not beat.repeated:
         # The motion shows whether header stamps are the sampling instants.
         signal = next((s for n, s in motor.plan.signals.items() if n in _MOTION), None)
-        if clock.rhythm(time).regular or signal is None or signal.topic != topic:
+        if clock.measure_rhythm(time).regular or signal is None or signal.topic != topic:
             return time
         motion = table.columns[signal.field].astype(np.float64)
         if not moves_on(beat, time, motion):
@@ -103,7 +103,7 @@ def _check(motor: Motor, series: dict[str, Series]) -> None:
             text = "the voltage has a sign already, so that the direction is not used; leave it out"
             motor.tell("direction_not_used", text)
         else:
-            series["voltage"] = checks.signed(series["voltage"], way, motor.where)
+            series["voltage"] = checks.apply_direction(series["voltage"], way, motor.where)
     for name in sorted(series, key=lambda name: name != "count"):
         value = series[name].value
         if name == "count":  # a wrap is not a jump
@@ -112,7 +112,7 @@ def _check(motor: Motor, series: dict[str, Series]) -> None:
                     f"{motor.where}: the count stays at {last}, the end of a counter's range: "
                     "it is full; record a wider one, or one that wraps"
                 )
-            count = unwrapped(motor, series).count
+            count = unwrap_counts(motor, series).count
             value = (count - count[:1]).astype(np.float64)
             step = np.quantile(np.abs(np.diff(value)), 0.9) if value.size > 1 else 0.0
             if step > MAX_COUNT_STEP.value and not motor.plan.own:
@@ -120,7 +120,9 @@ def _check(motor: Motor, series: dict[str, Series]) -> None:
                     f"{motor.where}: the count moves by {step:.2g} between samples, more than an "
                     "encoder counts; map the column of its counts"
                 )
-        bad = checks.impossible(value, steps_allowed=name in ("voltage", "supply", "current"))
+        bad = checks.find_impossible_values(
+            value, steps_allowed=name in ("voltage", "supply", "current")
+        )
         if bad.any():
             worst = float(np.abs(value[bad]).max())
             text = f"{name}: {int(bad.sum())} values with impossible jumps (up to {worst:.4g})"
@@ -164,7 +166,9 @@ def _clock(motor: Motor) -> dict[str, Integers]:
         text = "time: header stamps (the instants of sampling, free of transport delay)"
         motor.tell("time_base", text)
         _report_offset(motor, next(iter(tables)), fits)
-        if any(len(clock.epochs(stamp)) > 1 for stamp in stamps.values() if stamp is not None):
+        if any(
+            len(clock.split_at_resets(stamp)) > 1 for stamp in stamps.values() if stamp is not None
+        ):
             return _times_across_resets(motor, tables, stamps)
         return {topic: stamp for topic, stamp in stamps.items() if stamp is not None}
     if not fits:
@@ -198,10 +202,10 @@ def _times_across_resets(
     topic, table = next(iter(tables.items()))
     stamp = stamps[topic]
     assert stamp is not None
-    parts, log = clock.epochs(stamp), table.logged
+    parts, log = clock.split_at_resets(stamp), table.logged
     least = clock.pause_between(stamp, parts, motor.plan.gap)
     pauses = [max(int(log[begin] - log[begin - 1]), least) for begin, _ in parts[1:]]
-    time = clock.one_after_another([stamp], [parts], pauses)[0]
+    time = clock.concatenate_parts([stamp], [parts], pauses)[0]
     text = f"{topic}: the clock of the header stamps was set back {len(pauses)} times"
     motor.tell("clock_set_back", f"{text}; a new segment each", "warning", times=len(pauses))
     return {topic: time}

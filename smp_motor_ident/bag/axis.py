@@ -10,9 +10,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from smp_motor_control.arrays import Array, Flags, Integers
-from smp_motor_ident.bag.clock import BEAT_SAMPLES, mean_held, recorded_at, rhythm
-from smp_motor_ident.bag.counter import Unwrapped, angle_resets, reset_found, unwrap
-from smp_motor_ident.bag.drives import answers_in_its_row, rows_behind
+from smp_motor_ident.bag.clock import (
+    BEAT_SAMPLES,
+    average_held_input,
+    find_first_time,
+    measure_rhythm,
+)
+from smp_motor_ident.bag.counter import Unwrapped, angle_resets, report_resets, unwrap
+from smp_motor_ident.bag.drives import find_late_rows, responds_in_its_row
 from smp_motor_ident.bag.mapping import MotorMap
 from smp_motor_ident.bag.names import MOTIONS
 from smp_motor_ident.bag.storage import Table, found
@@ -67,11 +72,11 @@ class Series:
         return Series(self.time[which], self.value[which], number, self.bits)
 
 
-def on_one_axis(motor: Motor, series: dict[str, Series], axis_name: str) -> Record:
+def resample_to_output(motor: Motor, series: dict[str, Series], axis_name: str) -> Record:
     """Make a record of signals with different sampling instants."""
     if "supply" in series:
         _multiply_duty_by_supply(series)
-    voltage = finite(series["voltage"])
+    voltage = select_finite(series["voltage"])
     axis = series[axis_name].time
     alike = np.array_equal(voltage.time, axis)
     keep = np.ones(axis.size, bool) if alike else _find_covered_samples(motor, voltage, axis)
@@ -83,7 +88,11 @@ def on_one_axis(motor: Motor, series: dict[str, Series], axis_name: str) -> Reco
     )
     axis = axis[keep]
     # Mean voltage over the interval that ends at each sample
-    values = voltage.value.copy() if alike else mean_held(voltage.time, voltage.value, held, axis)
+    values = (
+        voltage.value.copy()
+        if alike
+        else average_held_input(voltage.time, voltage.value, held, axis)
+    )
     if alike and held == "after":
         values[1:] = voltage.value[:-1]
     starts |= _find_gaps(motor, axis, alike, held, voltage, values)
@@ -110,7 +119,7 @@ def on_one_axis(motor: Motor, series: dict[str, Series], axis_name: str) -> Reco
         source=motor.source,
         findings=tuple(f for k, f in enumerate(motor.findings) if f not in motor.findings[:k]),
         velocity_window=motor.plan.velocity_window,
-        recorded=recorded_at(motor.tables[topic].logged for topic in motor.plan.topics),
+        recorded=find_first_time(motor.tables[topic].logged for topic in motor.plan.topics),
         **columns,
     )
 
@@ -123,14 +132,14 @@ def _undo_delay(
     longest = int(np.argmax(np.diff(edges)))
     part = slice(edges[longest], min(edges[longest + 1], edges[longest] + MAX_TESTED_ROWS))
     name, motion = next((n, v[part]) for n in MOTIONS if (v := columns.get(n)) is not None)
-    if not rhythm(axis[part]).regular or not np.isfinite(motion).all():
+    if not measure_rhythm(axis[part]).regular or not np.isfinite(motion).all():
         return axis, columns, starts
     if name != "velocity":
         motion = np.diff(motion, prepend=motion[:1])
-    rows = rows_behind(columns["voltage"][part], motion.astype(np.float64))
+    rows = find_late_rows(columns["voltage"][part], motion.astype(np.float64))
     if rows < MIN_SHIFT_ROWS:
         return axis, columns, starts
-    late = rows * rhythm(axis[part]).interval * 1e-9
+    late = rows * measure_rhythm(axis[part]).interval * 1e-9
     text = (
         f"the voltage is recorded {1e3 * late:.3g} ms ({rows} rows) after it acts: the motion is "
         "ahead of it, or was smoothed both ways; it was moved back"
@@ -150,16 +159,16 @@ def _detect_hold(motor: Motor, voltage: Series, output: Series, name: str, start
     motion = output.value.astype(np.float64)
     if name != "velocity":
         motion = np.diff(motion, prepend=motion[:1])
-    gap = rhythm(output.time).gap()
+    gap = measure_rhythm(output.time).gap()
     motion[starts | (np.diff(output.time, prepend=output.time[:1]) > gap)] = np.nan
-    if not answers_in_its_row(voltage.value, motion):
+    if not responds_in_its_row(voltage.value, motion):
         return "after"
     text = f"the {name} responds in the row of a change of voltage: the voltage acts before its row"
     motor.tell("held_before", f"{text} (held=before; map held=after if it did not)")
     return "before"
 
 
-def finite(series: Series) -> Series:
+def select_finite(series: Series) -> Series:
     """Return the finite samples."""
     sound = np.isfinite(series.value)
     return series if sound.all() else series.take(sound)
@@ -167,7 +176,7 @@ def finite(series: Series) -> Series:
 
 def _multiply_duty_by_supply(series: dict[str, Series]) -> None:
     """Multiply the duty cycle by the measured supply voltage."""
-    supply, voltage = finite(series.pop("supply")), series["voltage"]
+    supply, voltage = select_finite(series.pop("supply")), series["voltage"]
     if not supply.time.size:
         raise BagError("the supply signal has no finite value")
     measured = np.interp(voltage.time - supply.time[0], supply.time - supply.time[0], supply.value)
@@ -180,7 +189,7 @@ def _find_covered_samples(motor: Motor, voltage: Series, axis: Integers) -> Flag
     if not keep.all():
         text = f"{int((~keep).sum())} samples before the first voltage were left out"
         motor.tell("no_voltage_yet", text)
-    beat = rhythm(voltage.time)
+    beat = measure_rhythm(voltage.time)
     if beat.regular:
         limit = beat.gap()
         index = np.searchsorted(voltage.time, axis, "right") - 1
@@ -198,7 +207,7 @@ def _count_starts(motor: Motor, series: dict[str, Series], keep: Flags, axis_nam
     flags = np.zeros(keep.size, bool)
     flags[0] = True
     if axis_name == "count":
-        counter = unwrapped(motor, series)
+        counter = unwrap_counts(motor, series)
         motor.findings += counter.findings
         count = counter.count
         if np.abs(count.astype(np.float64)).max() >= 2.0**53:  # beyond exact floats
@@ -207,14 +216,14 @@ def _count_starts(motor: Motor, series: dict[str, Series], keep: Flags, axis_nam
         flags[counter.resets] = True
     elif axis_name == "position":
         resets = angle_resets(series["position"].value)
-        motor.findings += [reset_found("angle", resets.size)] if resets.size else []
+        motor.findings += [report_resets("angle", resets.size)] if resets.size else []
         flags[resets] = True
     # A reset at a sample that is left out begins a segment at the next that is kept.
     begun = np.cumsum(flags)[keep]
     return np.concatenate([[True], np.diff(begun) > 0])
 
 
-def unwrapped(motor: Motor, series: dict[str, Series]) -> Unwrapped:
+def unwrap_counts(motor: Motor, series: dict[str, Series]) -> Unwrapped:
     """Return the counter without its wraps."""
     counted = series["count"]
     given = "encoder_bits" in motor.plan.hardware
@@ -243,11 +252,11 @@ def _find_gaps(
     motor: Motor, axis: Integers, alike: bool, held: str, voltage: Series, values: Array
 ) -> Flags:
     """Return where segments begin because samples are missing; bridge the voltage over a few."""
-    beat = rhythm(axis)
+    beat = measure_rhythm(axis)
     steps, missing = np.diff(axis), beat.missing(axis)
     edges = [0, *(np.flatnonzero(steps > beat.gap()) + 1).tolist(), axis.size]
     for a, b in pairwise(edges):  # each run may have its own rate
-        if (own := rhythm(axis[a:b])).regular and b - a > BEAT_SAMPLES:
+        if (own := measure_rhythm(axis[a:b])).regular and b - a > BEAT_SAMPLES:
             missing[a : b - 1] = own.missing(axis[a:b])
     if alike and voltage.number is not None:  # the publisher's numbers tell losses
         missing = np.maximum(np.diff(voltage.number) - 1, 0)
@@ -287,7 +296,7 @@ def _interpolate(
     if series.time.size == keep.size and np.array_equal(series.time[keep], axis):
         values = series.value if keep.all() else series.value[keep]
     else:
-        sound = finite(series)
+        sound = select_finite(series)
         if sound.time.size < 2:
             return None
         origin = sound.time[0]
@@ -295,7 +304,7 @@ def _interpolate(
         after = np.clip(np.searchsorted(sound.time, axis), 1, sound.time.size - 1)
         apart = sound.time[after] - sound.time[after - 1]
         exact = np.isin(axis, sound.time)
-        values[(apart > 3 * rhythm(sound.time).interval) & ~exact] = np.nan
+        values[(apart > 3 * measure_rhythm(sound.time).interval) & ~exact] = np.nan
         motor.tell("interpolated", f"{name}: interpolated to the instants of the main output")
     if name == "count":
         return values

@@ -18,7 +18,7 @@ _MIN_SAMPLES = 50
 _MAX_QUANTILE_SAMPLES = 5000  # values used for quantiles and means
 
 
-def impossible(value: Array, *, steps_allowed: bool) -> Flags:
+def find_impossible_values(value: Array, *, steps_allowed: bool) -> Flags:
     """Return which values jump away and back by more than the signal's own range allows.
 
     A value is impossible if it lies many spans of the signal away from its neighbours, or, for a
@@ -79,7 +79,7 @@ def has_sign(value: Array) -> bool:
     return bool(min(np.sum(value > 0), np.sum(value < 0)) > least)
 
 
-def signed(size: Series, direction: Series, where: str) -> Series:
+def apply_direction(size: Series, direction: Series, where: str) -> Series:
     """Return a signal with the sign of a direction column: negative where it is 0 or below."""
     levels = np.unique(direction.value[np.isfinite(direction.value)])
     if not 1 <= levels.size <= 3 or (levels.min() >= 0 and (levels > 0).sum() > 1):

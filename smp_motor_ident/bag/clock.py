@@ -36,7 +36,7 @@ MIN_SET_CLOCK_NS = 1_000_000_000_000_000_000
 """Smallest time [ns] of a clock that was set, in 2001; smaller ones count from some start."""
 
 
-def recorded_at(logs: Iterable[Integers]) -> float | None:
+def find_first_time(logs: Iterable[Integers]) -> float | None:
     """Return the first log time of a clock that was set [s since 1970], or None."""
     dated = [log[log >= MIN_SET_CLOCK_NS] for log in logs]
     first = [int(log.min()) for log in dated if log.size]
@@ -112,7 +112,7 @@ def judge_stamps(stamp: Integers | None, log: Integers) -> str:
     return ""
 
 
-def epochs(time: Integers) -> Parts:
+def split_at_resets(time: Integers) -> Parts:
     """Split samples, in the order of logging, where their clock was set back.
 
     Single samples out of order are no reason to split, nor are shuffled ones: only long runs,
@@ -169,7 +169,7 @@ class Rhythm:
         return max(100 * self.interval, 1.0 * _SECOND)
 
 
-def rhythm(time: Integers) -> Rhythm:
+def measure_rhythm(time: Integers) -> Rhythm:
     """Return the regularity of sampling."""
     if time.size < 2:
         return Rhythm(0.0, False)
@@ -178,7 +178,7 @@ def rhythm(time: Integers) -> Rhythm:
     return Rhythm(median, bool(np.mean(np.abs(steps - median) <= 0.25 * median) >= 0.8))
 
 
-def mean_held(time: Integers, value: Array, held: str, at: Integers) -> Array:
+def average_held_input(time: Integers, value: Array, held: str, at: Integers) -> Array:
     """Average a held input over the intervals between output samples."""
     origin = int(time[0])
     seconds = (time - origin) * 1e-9
@@ -201,7 +201,7 @@ def mean_held(time: Integers, value: Array, held: str, at: Integers) -> Array:
     return mean
 
 
-def runs(time: NDArray[Any], columns: Mapping[str, NDArray[Any]]) -> Parts:
+def split_into_runs(time: NDArray[Any], columns: Mapping[str, NDArray[Any]]) -> Parts:
     """Split a table's rows, in the order in which they were written, where its clock starts again.
 
     A run begins where the time goes back by more than jitter, continues from there and overlaps
@@ -260,7 +260,7 @@ def _overlaps(
     return not (twice and first.size >= 0.5 * inside.size)
 
 
-def one_after_another(
+def concatenate_parts(
     times: Sequence[Integers], parts: Sequence[Parts], pauses: Sequence[int]
 ) -> list[Integers]:
     """Return times [ns] on one continuous clock, with a pause between parts.
@@ -276,7 +276,7 @@ def one_after_another(
     return moved
 
 
-def without_leaps(
+def remove_leaps(
     times: Mapping[str, Integers], gap: float
 ) -> tuple[dict[str, Integers], list[float]]:
     """Return times [ns] with forward leaps of the clock removed, and the leaps [s].
@@ -300,13 +300,13 @@ def without_leaps(
 def pause_between(time: Integers, parts: Parts, gap: float) -> int:
     """Return a pause [ns] that begins a new segment; ``gap`` [s] is the user's limit."""
     longest = max(parts, key=lambda part: part[1] - part[0])
-    usual = rhythm(np.sort(time[slice(*longest)])).gap()
+    usual = measure_rhythm(np.sort(time[slice(*longest)])).gap()
     return 3 * round(max(usual, gap * _SECOND)) + _SECOND
 
 
-def laid_out(tables: Mapping[str, Table], gap: float, where: str) -> dict[str, Table]:
+def lay_out_runs(tables: Mapping[str, Table], gap: float, where: str) -> dict[str, Table]:
     """Return tables of one clock with their runs in sequence; BagError if the runs differ."""
-    every = {topic: runs(table.logged, table.columns) for topic, table in tables.items()}
+    every = {topic: split_into_runs(table.logged, table.columns) for topic, table in tables.items()}
     numbers = {topic: len(parts) - 1 for topic, parts in every.items()}
     if not any(numbers.values()):
         return dict(tables)
@@ -319,7 +319,7 @@ def laid_out(tables: Mapping[str, Table], gap: float, where: str) -> dict[str, T
     times = [table.logged for table in tables.values()]
     pause = max(pause_between(t, parts, gap) for t, parts in zip(times, every.values()))
     count = next(iter(numbers.values()))
-    moved = one_after_another(times, list(every.values()), [pause] * count)
+    moved = concatenate_parts(times, list(every.values()), [pause] * count)
     text = f"{where}: the time starts again {count} times, as of runs written one below another"
     warning = found("clock_set_back", f"{text}; a new segment each", "warning", times=count)
     return {

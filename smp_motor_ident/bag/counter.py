@@ -42,7 +42,7 @@ class Wrap:
         return abs(width - self.width) <= 4 * self.deviation + 1e-6 * self.width
 
 
-def wrap_of(value: Array) -> Wrap | None:
+def find_wrap(value: Array) -> Wrap | None:
     """Return the width at which a signal wraps; None if it evidently does not.
 
     A wrapping signal approaches an end of its range, jumps to the other end and continues in the
@@ -75,7 +75,7 @@ def wrap_of(value: Array) -> Wrap | None:
     return Wrap(width, 1.2533 * scatter / np.sqrt(jump.size - 1), jump.size)
 
 
-def counts_of(wrap: Wrap, span: int) -> int:
+def round_to_counts(wrap: Wrap, span: int) -> int:
     """Return the roundest width in counts that a wrap admits: a power of two, or of most zeros."""
     spread = 4 * wrap.deviation + 0.5
     first = max(math.ceil(wrap.width - spread), span + 1)
@@ -84,13 +84,13 @@ def counts_of(wrap: Wrap, span: int) -> int:
     return next(n for r in (power, 1000, 100, 20, 10, 4, 1) if (n := -(-first // r) * r) <= last)
 
 
-def angle_of(wrap: Wrap) -> float:
+def round_to_turns(wrap: Wrap) -> float:
     """Return the width in radians: the whole number or part of turns that a wrap admits."""
     turns = [*range(1, _MAX_TURNS + 1), *(1 / k for k in range(2, _MAX_TURNS + 1))]
     return next((w for n in turns if wrap.admits(w := 2 * np.pi * n)), wrap.width)
 
 
-def undone(value: Array, width: float) -> Array:
+def undo_wraps(value: Array, width: float) -> Array:
     """Return a signal without its wraps."""
     steps = np.diff(value)
     whole = steps - width * np.rint(steps / width)
@@ -126,7 +126,7 @@ def unwrap(count: Integers, bits: int | None, expected: Array | None = None) -> 
     if bits is None and (width := _estimate_width(count, steps, guess)):
         if width & (width - 1):
             text = f"the encoder starts again at {width} counts; it was unwrapped"
-            whole = np.rint(undone(count.astype(np.float64), width)).astype(np.int64)
+            whole = np.rint(undo_wraps(count.astype(np.float64), width)).astype(np.int64)
             findings.append(found("counter_wraps", text, counts=width))
             return Unwrapped(whole, np.zeros(0, np.int64), findings)
         bits = width.bit_length() - 1
@@ -138,7 +138,7 @@ def unwrap(count: Integers, bits: int | None, expected: Array | None = None) -> 
         steps = near + (((steps - near) << shift) >> shift)
     resets = _find_resets(count, steps, guess, expected is not None) + 1
     if resets.size:
-        findings.append(reset_found("encoder's counter", resets.size))
+        findings.append(report_resets("encoder's counter", resets.size))
         steps = steps.copy()
         steps[resets - 1] = np.diff(count)[resets - 1]
     if bits and bits < 62 and expected is None:
@@ -149,7 +149,7 @@ def unwrap(count: Integers, bits: int | None, expected: Array | None = None) -> 
     return Unwrapped(whole, resets, findings)
 
 
-def reset_found(what: str, times: int) -> Finding:
+def report_resets(what: str, times: int) -> Finding:
     """Report resets of a counter or an angle."""
     text = f"the {what} was reset {times} times; a new segment each"
     return found("counter_reset", text, "warning", times=times)
@@ -158,7 +158,7 @@ def reset_found(what: str, times: int) -> Finding:
 def _estimate_width(count: Integers, steps: Integers, guess: Array) -> int:
     """Return the count at which a counter restarts, estimated from its data; 0 if none."""
     bits = _width(steps, guess)
-    wrap = wrap_of(count.astype(np.float64))
+    wrap = find_wrap(count.astype(np.float64))
     if wrap is None or (bits and wrap.admits(2.0**bits)):
         return 2**bits if bits else 0
     if not wrap.is_known:
@@ -166,7 +166,7 @@ def _estimate_width(count: Integers, steps: Integers, guess: Array) -> int:
             f"the encoder's count starts again {wrap.times} times, at about {wrap.width:.4g} "
             "counts, but its range is uncertain; record faster, or a continuous counter"
         )
-    return counts_of(wrap, int(np.ptp(count)))
+    return round_to_counts(wrap, int(np.ptp(count)))
 
 
 def is_full(count: Integers) -> int:
@@ -240,17 +240,17 @@ def unwrap_angle(angle: Array) -> tuple[Array, float]:
         return angle, 0.0
     width = turn
     if np.ptp(values) > turn * 1.001 or np.max(np.abs(np.diff(values))) < np.pi:
-        wrap = wrap_of(values)
+        wrap = find_wrap(values)
         if wrap is None:
             return angle, 0.0
-        width = angle_of(wrap)
+        width = round_to_turns(wrap)
         if width == wrap.width and not wrap.is_known:
             raise BagError(
                 f"the position starts again {wrap.times} times, at about {wrap.width:.4g} rad, "
                 "which is not a turn or a part of one; record faster, or a continuous angle"
             )
     result = angle.copy()
-    result[sound] = undone(values, width)
+    result[sound] = undo_wraps(values, width)
     check_aliasing(np.diff(result[sound]), width, "angle")
     return result, width
 

@@ -16,9 +16,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from smp_motor_control.arrays import Integers
-from smp_motor_ident.bag.source import Recording, recordings
+from smp_motor_ident.bag.source import Recording, find_recordings
 from smp_motor_ident.bag.storage import Batch, Channel, Table, damaged, gather
-from smp_motor_ident.bag.template import DecodeError, Number, Text, locate, parse_path, take_apart
+from smp_motor_ident.bag.template import (
+    DecodeError,
+    Number,
+    Text,
+    locate,
+    parse_message,
+    parse_path,
+)
 from smp_motor_ident.bag.types import Definitions, Types
 from smp_motor_ident.bag.unpack import Budget, decompress_messages
 from smp_motor_ident.errors import BagError
@@ -101,7 +108,7 @@ class Decoder:
         self._candidates, candidates = tee(self._candidates)
         for definitions in candidates:
             try:
-                template = take_apart(data, self.name, definitions, self._encoding)
+                template = parse_message(data, self.name, definitions, self._encoding)
                 break
             except DecodeError as error:
                 self.reason = self.reason or str(error)
@@ -260,7 +267,7 @@ def read_columns(path: Path, wanted: Mapping[str, Sequence[str]]) -> dict[str, T
     """Read fields of topics of one bag; a topic without a message is an error."""
     asked = {topic: list(fields) for topic, fields in wanted.items()}
     found: dict[str, Table] = {}
-    for recording in recordings([path]):
+    for recording in find_recordings([path]):
         found |= collect(recording, asked, Types())
         for topic in asked:
             if not found[topic].logged.size:

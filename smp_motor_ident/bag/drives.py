@@ -28,7 +28,7 @@ MAX_FIT_ROWS = 5000  # rows used for a fit
 MOTION_BLOCKS = 200  # averaged stretches of a motion, which reduce a counter's noise
 
 
-def unexplained(u: Array, y: Array) -> float | None:
+def find_unexplained_share(u: Array, y: Array) -> float | None:
     """Return the share of a motion that a voltage leaves unexplained; None if it explains nothing.
 
     Its past must predict the motion better than the motion's own past does (Granger's test, an F
@@ -51,7 +51,7 @@ def unexplained(u: Array, y: Array) -> float | None:
     return rests[1] / rests[0] if fdtrc(LAGS, free, ratio) < EXPLANATION_LEVEL.value else None
 
 
-def answers_in_its_row(u: Array, y: Array) -> bool:
+def responds_in_its_row(u: Array, y: Array) -> bool:
     """Return whether a motion responds to a command in the same row.
 
     Then the command acts over the interval that ends at the row, since a later one could not have
@@ -69,7 +69,7 @@ def answers_in_its_row(u: Array, y: Array) -> bool:
     return at_once > max(-float(ndtri(EXPLANATION_LEVEL.value)) * scatter, later)
 
 
-def follows(u: Array, y: Array) -> tuple[float, bool]:
+def find_following_share(u: Array, y: Array) -> tuple[float, bool]:
     """Return the share of a signal that follows another with a lag, and whether it is an integral.
 
     The signal or its increments must be mostly a first-order lag of the other, and fit that better
@@ -78,11 +78,11 @@ def follows(u: Array, y: Array) -> tuple[float, bool]:
     if np.count_nonzero(np.diff(u)) < LAGS or _is_clock(u) or _is_clock(y):
         return 0.0, False
     steps = np.diff(y, prepend=y[:1])
-    itself = late(u, y) if _explained_share(u, steps) < HALF_EXPLAINED.value else 0.0
-    return max((itself, False), (late(u, steps), True))
+    itself = find_lagged_share(u, y) if _explained_share(u, steps) < HALF_EXPLAINED.value else 0.0
+    return max((itself, False), (find_lagged_share(u, steps), True))
 
 
-def rows_behind(u: Array, y: Array) -> int:
+def find_late_rows(u: Array, y: Array) -> int:
     """Return the number of rows by which a command is recorded late; 0 if it leads the motion.
 
     A cross-correlation of first-order lags with the motion gives a coarse shift; around it,
@@ -147,14 +147,14 @@ def _residual_share(u: Array, y: Array, shift: int, lag: float) -> float:
     return best / float(np.sum((y[::every] - y[::every].mean()) ** 2))
 
 
-def late(u: Array, y: Array) -> float:
+def find_lagged_share(u: Array, y: Array) -> float:
     """Return the share of a signal explained by a lag of another; 0 if another shift is better."""
     lags = np.geomspace(1.0, max(y.size / 20, 2.0), 8)
     share = max(_explained_share(lagged(u - u[0], float(lag)), y) for lag in lags)
     return share if share > max(HALF_EXPLAINED.value, _explained_share(u, y)) else 0.0
 
 
-def clock_of(values: list[Array]) -> int | None:
+def find_clock(values: list[Array]) -> int | None:
     """Return the column of time: the one that rises most evenly."""
     uneven = {k: np.std(np.diff(x)) / np.ptp(x) for k, x in enumerate(values) if _is_clock(x)}
     return min(uneven, key=lambda k: float(uneven[k]), default=None)

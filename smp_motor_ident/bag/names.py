@@ -62,7 +62,7 @@ _NUMBERED = re.compile(rf"{_MOTOR}[\W_]*(?:id|no|nr|num|number|idx|index|name)\W
 _NAMED = re.compile(_MOTOR, re.IGNORECASE)
 
 
-def tells_motors(column: str, words: Sequence[str] = ()) -> bool:
+def separates_motors(column: str, words: Sequence[str] = ()) -> bool:
     """Return whether a column names the motor of each row: ``motor_id``.
 
     A column called ``wheel`` alone does if its words are sides, letters or numbered.
@@ -72,7 +72,7 @@ def tells_motors(column: str, words: Sequence[str] = ()) -> bool:
     return named or _NUMBERED.fullmatch(column.strip()) is not None
 
 
-def worded(name: str) -> str:
+def split_words(name: str) -> str:
     """Return a name with its words separated: ``velLeft`` is ``vel_Left``, ``u2`` is ``u_2``."""
     return re.sub(r"(?<=[a-z\d])(?=[A-Z])|(?<=[A-Za-z])(?=\d+$)", "_", name)
 
@@ -80,7 +80,7 @@ def worded(name: str) -> str:
 def role_of(topic: str, path: str) -> str:
     """Return a field's role by its own name, else by its parent's, else by its topic's."""
     for text in (*reversed(re.sub(r"\[[^\]]*\]", "", path).split(".")), topic):
-        said = [r for r, pattern in ROLES.items() if re.search(pattern, worded(text), re.I)]
+        said = [r for r, pattern in ROLES.items() if re.search(pattern, split_words(text), re.I)]
         if said[:1] == ["voltage"] and "velocity" in said and not drives_by_name(text):
             return ""  # a speed command
         if said:
@@ -88,7 +88,7 @@ def role_of(topic: str, path: str) -> str:
     return ""
 
 
-def of_a_place(paths: Sequence[str]) -> set[str]:
+def find_pose_fields(paths: Sequence[str]) -> set[str]:
     """Return the fields of a robot's pose: x and y together with a heading."""
     by_name: dict[tuple[str, str], str] = {}
     for path in paths:
@@ -101,7 +101,7 @@ def of_a_place(paths: Sequence[str]) -> set[str]:
 
 def is_speed_command(name: str) -> bool:
     """Return whether type and name denote a speed command instead of a voltage."""
-    speed = re.search(SPEED_COMMAND, worded(name), re.IGNORECASE) is not None
+    speed = re.search(SPEED_COMMAND, split_words(name), re.IGNORECASE) is not None
     return speed and not drives_by_name(name)
 
 
@@ -118,7 +118,7 @@ def hint_of(role: str, source: str) -> str:
 
 def wheel_of(source: str) -> str:
     """Return the side of the robot in a name."""
-    words = re.split(r"[^a-z]+", worded(source).lower())
+    words = re.split(r"[^a-z]+", split_words(source).lower())
     return "_".join(side for side in _SIDES if side in words)
 
 

@@ -98,7 +98,7 @@ def _fields(types: Types, batch: Any) -> tuple[list[str], str]:
     try:
         for definitions in types.candidates(channel):
             try:
-                root = template.take_apart(
+                root = template.parse_message(
                     batch.message(0), channel.type, definitions, channel.encoding
                 ).root
             except template.DecodeError as error:
@@ -122,7 +122,7 @@ def _paths(path: str, value: Any, parent: dict[str, Any]) -> Iterator[str]:
     ):
         count = (value.count or 0) if isinstance(value, template.Number) else len(value)
         keys: list[Any] = list(range(min(count, _MAX_LISTED)))
-        for texts in template.names_beside(parent).values():
+        for texts in template.find_name_lists(parent).values():
             if len(texts) == count and len({text.value for text in texts}) == count:
                 keys = [text.value for text in texts]
                 break

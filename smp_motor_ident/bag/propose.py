@@ -16,14 +16,14 @@ import numpy as np
 from smp_motor_control.arrays import Array
 from smp_motor_control.errors import is_ros_name
 from smp_motor_ident.bag import axis, checks, decode, drives, mapping, names, read, storage
-from smp_motor_ident.bag.clock import runs
+from smp_motor_ident.bag.clock import split_into_runs
 from smp_motor_ident.bag.offers import Listing, Offer, Proposal, offers_of
-from smp_motor_ident.bag.source import Recording, recordings
+from smp_motor_ident.bag.source import Recording, find_recordings
 from smp_motor_ident.bag.tables import (
     MIN_TIMES_SINCE_1970,
     TIME_NAMES,
     is_time_of_part,
-    self_described,
+    plan_from_names,
 )
 from smp_motor_ident.bag.types import Types
 from smp_motor_ident.bag.units import needs, unit_of
@@ -83,7 +83,7 @@ def list_topics(paths: Any, msg_files: Iterable[str] = ()) -> list[Listing]:
     """List the topics of recordings, and suggest mappings."""
     types = Types(msg_files)
     listings = []
-    for recording in recordings(paths):
+    for recording in find_recordings(paths):
         with read.one_line(recording):
             offers = offers_of(recording, types)
             needed = all(offer.type != read.STATE for offer in offers)
@@ -186,7 +186,7 @@ def _namespace(candidate: _Candidate) -> tuple[str, str]:
 
 def _may_drive(value: Array) -> bool:
     """Return whether a field's values allow a voltage: not all 0, and not a clock."""
-    return bool(value.any()) and drives.clock_of([value]) is None
+    return bool(value.any()) and drives.find_clock([value]) is None
 
 
 def _is_torque(candidate: _Candidate) -> bool:
@@ -224,13 +224,13 @@ def _parent_of(path: str) -> str:
 def _add_direction(voltage: _Candidate, way: _Candidate) -> _Candidate:
     """Return a magnitude of voltage with its direction; BagError if the codes have no sign."""
     size, direction = (axis.Series(c.time.astype(np.int64), c.value) for c in (voltage, way))
-    return replace(voltage, value=checks.signed(size, direction, way.source).value)
+    return replace(voltage, value=checks.apply_direction(size, direction, way.source).value)
 
 
 def _find_unnamed_time(every: list[_Candidate]) -> _Candidate | None:
     """Return the unnamed column that rises like a time."""
     unnamed = [c for c in every if not c.role]
-    k = drives.clock_of([c.value for c in unnamed])
+    k = drives.find_clock([c.value for c in unnamed])
     return None if k is None else replace(unnamed[k], role="time")
 
 
@@ -244,9 +244,9 @@ def _by_data(every: list[_Candidate]) -> list[_Candidate]:
     best, pair = 0.0, []
     for u, y in product(voltages, motions) if unnamed else ():
         drive, moved = u.value[:_MAX_SAMPLES], y.value[:_MAX_SAMPLES]
-        share, summed = (0.0, False) if u is y else drives.follows(drive, moved)
+        share, summed = (0.0, False) if u is y else drives.find_following_share(drive, moved)
         steps = np.diff(moved, prepend=moved[:1]) if summed else moved
-        if share > best and drives.unexplained(drive, steps) is not None:
+        if share > best and drives.find_unexplained_share(drive, steps) is not None:
             way = "count" if np.array_equal(y.value, np.rint(y.value)) else "position"
             way = y.role or (way if summed else "velocity")
             best, pair = share, [replace(u, role="voltage"), replace(y, role=way)]
@@ -269,7 +269,11 @@ def _required_keys(
     if any(c.role == "count" or c.unit.startswith(":ticks") for c in chosen):
         asked["counts_per_revolution"] = "of the motor shaft"
     speed = next((c for c in chosen if c.role == "velocity" and not c.unit), None)
-    if table and speed and not re.search(names.WORDS_OF_RADIANS, names.worded(speed.path), re.I):
+    if (
+        table
+        and speed
+        and not re.search(names.WORDS_OF_RADIANS, names.split_words(speed.path), re.I)
+    ):
         asked["velocity"] = (
             f"its unit, {speed.source}:rpm or {speed.source}:deg/s, unless it is rad/s "
             f"(position={speed.source} if it is an angle)"
@@ -290,7 +294,7 @@ def _from_file(recording: Recording) -> Proposal | None:
     if not recording.is_table:
         return None
     try:
-        plans = self_described(recording, mapping.SignalMap())
+        plans = plan_from_names(recording, mapping.SignalMap())
     except BagError:
         return None
     items, rim = [], False
@@ -363,7 +367,7 @@ def _candidates(
     """Yield the fields with a role by name, and the others of a table."""
     named: list[tuple[str, Offer, str]] = []
     for offer in offers:
-        place = names.of_a_place(offer.fields)
+        place = names.find_pose_fields(offer.fields)
         for path in offer.fields:
             if (time and path == time.path) or is_time_of_part(path) or path in place:
                 continue
@@ -385,7 +389,7 @@ def _candidates(
         clock = table.stamp if table.stamp is not None and table.stamp.all() else table.log
         if clock is None and time is not None and time.path in table.columns:
             clock = time.value = table.columns[time.path]
-            if len(runs(clock, {})) > 1:  # in the order in which they were written
+            if len(split_into_runs(clock, {})) > 1:  # in the order in which they were written
                 clock = None
         at = np.arange(value.size) if clock is None else clock
         there = table.present.get(path)
@@ -410,7 +414,7 @@ def _check_count(role: str, value: Array) -> str:
 def _is_supply(name: str, value: Array) -> bool:
     """Return whether a voltage is a supply by its name and never falls to half its maximum."""
     size = np.abs(value)
-    named = re.search(names.MAY_BE_SUPPLY, names.worded(name), re.IGNORECASE)
+    named = re.search(names.MAY_BE_SUPPLY, names.split_words(name), re.IGNORECASE)
     return bool(named and size.size and 0 < size.max() < 2 * size.min())
 
 
@@ -449,7 +453,9 @@ def _unexplained_share(voltage: _Candidate, motion: _Candidate) -> float | None:
     if motion.role != "velocity":
         turn = _find_wrap(y) if motion.role == "position" else 0.0
         steps = np.diff(np.unwrap(y, period=turn) if turn else y, prepend=y[:1])
-        if drives.late(u, y) > drives.late(u, steps):  # counts of an interval are a speed
+        if drives.find_lagged_share(u, y) > drives.find_lagged_share(
+            u, steps
+        ):  # counts of an interval are a speed
             return None
         y = steps
-    return drives.unexplained(u, y)
+    return drives.find_unexplained_share(u, y)

@@ -16,9 +16,15 @@ from smp_motor_ident.bag.assemble import assemble
 from smp_motor_ident.bag.decode import collect
 from smp_motor_ident.bag.mapping import MotorMap, Signal, SignalMap
 from smp_motor_ident.bag.names import is_speed_command
-from smp_motor_ident.bag.source import Recording, recordings
+from smp_motor_ident.bag.source import Recording, find_recordings
 from smp_motor_ident.bag.storage import Channel, Table, found
-from smp_motor_ident.bag.tables import add_time_columns, apart, resolved, self_described, timed
+from smp_motor_ident.bag.tables import (
+    add_time_columns,
+    add_times,
+    plan_from_names,
+    resolve_signals,
+    separate_motors,
+)
 from smp_motor_ident.bag.types import Types
 from smp_motor_ident.errors import BagError
 from smp_motor_ident.finding import Finding
@@ -41,7 +47,7 @@ def read_experiments(paths: Any, mapping: Any = None) -> dict[str, list[Record]]
     failures: list[BagError] = []
     signals = [signal for motor in asked.motors.values() for signal in motor.signals.values()]
     topics = {signal.topic or signal.field for signal in signals}
-    for recording in recordings(paths, topics):
+    for recording in find_recordings(paths, topics):
         try:
             for record in read_recording(recording, asked, types):
                 read.setdefault(record.wheel, []).append(record)
@@ -175,8 +181,8 @@ def _records(recording: Recording, asked: SignalMap, types: Types) -> list[Recor
         description, findings = _description(wheel, plan, descriptions, tables)
         plan = replace(plan, hardware={**description, **plan.hardware})
         try:
-            for name, mine in apart(recording, wheel, plan, tables):
-                mine = timed(recording, plan, mine) if recording.is_table else mine
+            for name, mine in separate_motors(recording, wheel, plan, tables):
+                mine = add_times(recording, plan, mine) if recording.is_table else mine
                 record = assemble(name, plan, hardware_of(plan.hardware), mine, recording.name)
                 doubts = _question_voltage(plan, channels)
                 records.append(replace(record, findings=(*findings, *doubts, *record.findings)))
@@ -199,7 +205,9 @@ def _plans(recording: Recording, asked: SignalMap, channels: list[Channel]) -> d
     topics = {channel.topic for channel in channels}
     if asked.has_signals:
         plans = {
-            wheel: resolved(plan, channels) for wheel, plan in asked.motors.items() if plan.signals
+            wheel: resolve_signals(plan, channels)
+            for wheel, plan in asked.motors.items()
+            if plan.signals
         }
         for wheel, plan in plans.items():
             for name, signal in plan.signals.items():
@@ -211,7 +219,7 @@ def _plans(recording: Recording, asked: SignalMap, channels: list[Channel]) -> d
                     )
         return plans
     if recording.is_table:
-        return self_described(recording, asked)
+        return plan_from_names(recording, asked)
     states = sorted(channel.topic for channel in channels if channel.type == STATE)
     if not states:
         raise BagError(
@@ -281,7 +289,7 @@ def _description(
     return {}, []
 
 
-def described(message: Any) -> Hardware:
+def convert_description(message: Any) -> Hardware:
     """Return the hardware of a ``motor_description``."""
     return hardware_of({name: float(getattr(message, name)) for name in mappings.DESCRIBED})
 

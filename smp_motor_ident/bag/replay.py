@@ -8,7 +8,7 @@ from pathlib import Path
 
 import yaml
 
-from smp_motor_ident.bag.source import recordings
+from smp_motor_ident.bag.source import find_recordings
 from smp_motor_ident.bag.storage import Batch, Channel
 from smp_motor_ident.bag.unpack import decompress_messages
 from smp_motor_ident.errors import BagError
@@ -21,7 +21,7 @@ class Replay:
     """The messages of one bag: a folder or a bare file."""
 
     def __init__(self, path: Path) -> None:
-        found = recordings(path)
+        found = find_recordings(path)
         if len(found) > 1:
             names = ", ".join(recording.name for recording in found)
             raise BagError(f"{path}: holds several bags ({names}); name one")
@@ -69,7 +69,7 @@ class Replay:
             yield message(heapq.heappop(waiting))
 
 
-def offered(channel: Channel) -> tuple[bool, bool]:
+def find_offered_qos(channel: Channel) -> tuple[bool, bool]:
     """Return whether reliable and transient local messages were offered; reliable if unknown."""
     try:
         profiles = yaml.safe_load(channel.qos) if channel.qos else []

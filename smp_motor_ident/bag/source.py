@@ -161,7 +161,7 @@ class Recording:
         return self._sources[path]
 
 
-def recordings(paths: Any, topics: Collection[str] = ()) -> list[Recording]:
+def find_recordings(paths: Any, topics: Collection[str] = ()) -> list[Recording]:
     """Find the recordings behind paths, in the order given, folders by name.
 
     Tables whose names are among ``topics`` (``/STEM``) are one recording, on one clock.

@@ -12,7 +12,7 @@ from smp_motor_control.arrays import Flags, Integers
 from smp_motor_control.errors import is_ros_name
 from smp_motor_ident.bag import clock, limits, units
 from smp_motor_ident.bag.mapping import DEFAULT_MOTOR, MotorMap, Signal, SignalMap
-from smp_motor_ident.bag.names import MOTIONS, tells_motors
+from smp_motor_ident.bag.names import MOTIONS, separates_motors
 from smp_motor_ident.bag.readers.grid import without_unit
 from smp_motor_ident.bag.source import Recording
 from smp_motor_ident.bag.storage import TABLE, Channel, Table, found
@@ -41,7 +41,7 @@ def is_time_of_part(path: str) -> bool:
     return bool(whole and re.search(TIME_NAMES, last, re.IGNORECASE))
 
 
-def resolved(plan: MotorMap, channels: list[Channel]) -> MotorMap:
+def resolve_signals(plan: MotorMap, channels: list[Channel]) -> MotorMap:
     """Return a plan whose signals name topics and fields as the files do."""
     signals = {name: _of_topic(signal, channels) for name, signal in plan.signals.items()}
     if tables := [channel for channel in channels if channel.encoding == TABLE]:
@@ -83,7 +83,7 @@ def _unit(name: str, signal: Signal, channel: Channel, field: str) -> str:
     return units.unit_of(name, channel.units.get(field, ""), field)
 
 
-def self_described(recording: Recording, asked: SignalMap) -> dict[str, MotorMap]:
+def plan_from_names(recording: Recording, asked: SignalMap) -> dict[str, MotorMap]:
     """Return the plans of a table whose columns and units are named as the signals are.
 
     Those of a drivetrain have their side before the name, such as ``left_voltage``.
@@ -100,7 +100,7 @@ def self_described(recording: Recording, asked: SignalMap) -> dict[str, MotorMap
             given = asked.motors.get(wheel, asked.defaults)
             if abs(given.wheel_radius / (channel.wheel_radius or np.inf) - 1) < RADIUS_TOLERANCE:
                 given = replace(given, wheel_radius=channel.wheel_radius)
-            plans[wheel] = resolved(replace(given, signals=signals), channels)
+            plans[wheel] = resolve_signals(replace(given, signals=signals), channels)
     if plans:
         return plans
     raise BagError(
@@ -146,7 +146,7 @@ def _time_signal(recording: Recording, plan: MotorMap, topic: str) -> Signal | N
     )
 
 
-def apart(
+def separate_motors(
     recording: Recording, wheel: str, plan: MotorMap, tables: Mapping[str, Table]
 ) -> list[tuple[str, Mapping[str, Table]]]:
     """Return the tables of each motor named in a column, by the motor's name.
@@ -184,7 +184,7 @@ def _motor_columns(recording: Recording, topic: str) -> dict[str, tuple[str, ...
     """Return the columns of a table that name motors, with the words for their numbers."""
     channel = next(c for c in recording.channels() if c.topic == topic)
     words = {name: channel.words.get(name, ()) for name in channel.fields}
-    return {name: own for name, own in words.items() if tells_motors(name, own)}
+    return {name: own for name, own in words.items() if separates_motors(name, own)}
 
 
 def _rows(table: Table, which: Flags, finding: Finding) -> Table:
@@ -194,7 +194,9 @@ def _rows(table: Table, which: Flags, finding: Finding) -> Table:
     return replace(table, log=log, columns=columns, findings=[*table.findings, finding])
 
 
-def timed(recording: Recording, plan: MotorMap, tables: Mapping[str, Table]) -> dict[str, Table]:
+def add_times(
+    recording: Recording, plan: MotorMap, tables: Mapping[str, Table]
+) -> dict[str, Table]:
     """Return a plan's tables with their times in nanoseconds; rows without one are left out."""
     result = {}
     written = []
@@ -238,7 +240,7 @@ def timed(recording: Recording, plan: MotorMap, tables: Mapping[str, Table]) -> 
             )
         result[topic] = Table(log, None, columns, findings=findings, clocked=True)
     rows = {topic: result[topic] for topic in written}
-    return result | clock.laid_out(rows, plan.gap, recording.name)
+    return result | clock.lay_out_runs(rows, plan.gap, recording.name)
 
 
 def _check_seconds(log: Integers, signal: Signal, recording: Recording) -> None:

@@ -154,7 +154,7 @@ class _Parser:
         return Number(begin, self.order + _KINDS[name], count)
 
 
-def take_apart(data: bytes, name: str, definitions: Definitions, encoding: str) -> Template:
+def parse_message(data: bytes, name: str, definitions: Definitions, encoding: str) -> Template:
     """Return the positions in a message; the encoding is ``cdr`` or ``ros1``."""
     try:
         return _Parser(data, definitions, encoding == "ros1").parse(name)
@@ -162,7 +162,7 @@ def take_apart(data: bytes, name: str, definitions: Definitions, encoding: str) 
         raise DecodeError("its type is nested too deeply") from None
 
 
-def names_beside(parent: Mapping[str, Any]) -> dict[str, list[Text]]:
+def find_name_lists(parent: Mapping[str, Any]) -> dict[str, list[Text]]:
     """Return the lists of strings of a message, those called a name first."""
     lists = {
         key: value
@@ -209,7 +209,7 @@ def _element(here: Any, index: int) -> Any:
 
 def _index_of(name: str, parent: Mapping[str, Any], here: Any, used: list[Text]) -> int | None:
     """Return the index of a name among the names next to an array, or in its elements."""
-    beside = names_beside(parent)
+    beside = find_name_lists(parent)
     for texts in beside.values():
         if name in (values := [text.value for text in texts]):
             used.extend(texts)

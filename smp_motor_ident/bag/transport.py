@@ -49,7 +49,7 @@ class TransportDelay:
 def measure_delay(path: Path) -> dict[str, TransportDelay]:
     """Measure the delay of every wheel's loop with enough commands in a bag."""
     found: dict[str, TransportDelay] = {}
-    for recording in source.recordings([path]):
+    for recording in source.find_recordings([path]):
         found |= _of_recording(recording)
     if not found:
         raise BagError(
@@ -110,7 +110,7 @@ def _until_applied(state: Table, stamp: Integers, voltage: Array, period: float)
     left = []
     for trial in trials:
         shifted = stamp + round(1e9 * trial)
-        off = (acted - clock.mean_held(shifted, voltage, "after", time))[1:]
+        off = (acted - clock.average_held_input(shifted, voltage, "after", time))[1:]
         # Trimmed mean of the errors: ignore late and lost commands.
         left.append(math.sqrt(float(np.mean(np.sort(off**2)[: int(0.9 * off.size)]))))
     best = int(np.argmin(left))

@@ -8,10 +8,10 @@ from typing import Any
 
 from smp_motor_control.motor.file import MotorEntry
 from smp_motor_control.wheel.protection import Bounds
-from smp_motor_ident.bag.read import described
+from smp_motor_ident.bag.read import convert_description
 from smp_motor_ident.commission import wheel_test as judged
 from smp_motor_ident.commission.wheel_checks import Robot, judge
-from smp_motor_ident.commission.wheel_test import Figures, Phase, Trace, answers_well, settled
+from smp_motor_ident.commission.wheel_test import Figures, Phase, Trace, answers_well, has_settled
 from smp_motor_ident.finding import Finding
 from smp_motor_ident.record import Hardware
 
@@ -78,7 +78,7 @@ class _Way:
         """Return whether the wheel has settled since a row."""
         tape = self.test.tapes[self.wheel]
 
-        return lambda: settled(Trace.of(tape.rows[since:]))
+        return lambda: has_settled(Trace.of(tape.rows[since:]))
 
 
 def _constant(voltage: float) -> Callable[[float], float]:
@@ -97,7 +97,9 @@ def check_wheels(
     from smp_motor_control.nodes import wheel_test
 
     said = wheel_test.read_descriptions(client, wheels, TIMEOUT_S)
-    hardware = {wheel: described(said[wheel]) if wheel in said else Hardware() for wheel in wheels}
+    hardware = {
+        wheel: convert_description(said[wheel]) if wheel in said else Hardware() for wheel in wheels
+    }
     phases: list[Phase] = []
     counters = {wheel: wheel_test.make_counter(one) for wheel, one in hardware.items()}
     with wheel_test.WheelTest(client, counters, bounds).open() as test:
@@ -118,7 +120,7 @@ def check_wheels(
     robot = Robot(
         found,
         hardware,
-        judged.moved_with(traces, phases),
+        judged.count_coupled_motion(traces, phases),
         {w: known[w].parameters.dc_gain for w in wheels if w in known},
         {w: known[w].gearbox.ratio for w in wheels if w in known},
         wheel_test.read_battery(client),

@@ -65,7 +65,7 @@ def work(arguments: argparse.Namespace) -> int:
     _as_begun(arguments, begun.document)
     if arguments.dry_run:
         wheels = arguments.wheel or WHEELS
-        print("\n".join(plan.drawn(arguments.amplitude, arguments.duration, wheels)))
+        print("\n".join(plan.draw_plan(arguments.amplitude, arguments.duration, wheels)))
         return 0
     try:
         return _commission(arguments, folder, known)
@@ -215,7 +215,12 @@ def too_hot(folder: Path, earlier: Sequence[plan.Recording], last: plan.Recordin
         bag.read_experiments([str(folder / r.folder / r.name) for r in some]) if some else {}
         for some in (earlier, [last])
     )
-    return [f for w in now if w in before for f in winding.heated(w, before[w], now[w][0])]
+    return [
+        f
+        for w in now
+        if w in before
+        for f in winding.report_heated_winding(w, before[w], now[w][0])
+    ]
 
 
 def _design(session: Session) -> driving.Designed:
@@ -224,14 +229,16 @@ def _design(session: Session) -> driving.Designed:
     folder, gains = robot.folder, robot.folder / "gains.yaml"
     known = (folder / plan.FITTED / plan.FURTHER).is_dir()
     estimates = _identify(session, plan.IDENTIFYING)
-    more = None if known else plan.further(estimates, arguments.amplitude)
+    more = None if known else plan.plan_further(estimates, arguments.amplitude)
     if more:
         session.schedule.add_further(more, len(robot.wheels))
         _record(session, more)
         estimates = _identify(session, plan.AGAIN)
     if not made.has("judged"):
         made.add("identification", unreliable(estimates))
-        made.add("validation", validated(estimates, folder / plan.FITTED, folder / plan.HELD_OUT))
+        made.add(
+            "validation", validate_motors(estimates, folder / plan.FITTED, folder / plan.HELD_OUT)
+        )
         made.mark(judged=True)
         made.write()
     made.stop(made.refused("identification") or made.refused("validation"))
@@ -241,7 +248,7 @@ def _design(session: Session) -> driving.Designed:
         steps.tune_wheels(folder / "identification", gains, "--force", *accepted)
         made.mark(tuned=True)
         made.write()
-    return driving.designed(estimates, gains)
+    return driving.read_designs(estimates, gains)
 
 
 def _identify(session: Session, part: str) -> dict[str, Estimate]:
@@ -316,7 +323,9 @@ def unreliable(estimates: Mapping[str, Estimate]) -> list[Finding]:
     ]
 
 
-def validated(estimates: Mapping[str, Estimate], fitted: Path, held_out: Path) -> list[Finding]:
+def validate_motors(
+    estimates: Mapping[str, Estimate], fitted: Path, held_out: Path
+) -> list[Finding]:
     """Validate every motor on the held-out run."""
     found = []
     read = {path: bag.read_experiments([str(path)]) for path in (fitted, held_out)}
@@ -359,7 +368,8 @@ def _confirm(
     excited = f"for {seconds:.0f} s at up to {arguments.amplitude:g} V, then " if left else ""
     print(
         f"{', '.join(wheels)} will turn both ways {excited}in a drive on the new gains; all takes "
-        f"about {plan.words(schedule.left())}. Is the robot on blocks and clear of people? [y/N] ",
+        f"about {plan.format_duration(schedule.left())}. Is the robot on blocks and clear of "
+        "people? [y/N] ",
         end="",
         flush=True,
     )

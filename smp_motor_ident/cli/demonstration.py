@@ -62,7 +62,7 @@ def work(arguments: argparse.Namespace) -> int:
     figure = driving.drive_figure(driven, {"left": LEFT, "right": RIGHT}, hardware)
     (folder / "drive.svg").write_text(figure, encoding="utf-8")
     changes = {
-        w: driving.changes_of(w, one, driving.moves_in(segments, one.answers), designed)[0]
+        w: driving.changes_of(w, one, driving.find_moves(segments, one.answers), designed)[0]
         for w, one in driven.items()
     }
     verdict.show(truth, designed, changes)
@@ -107,14 +107,14 @@ def learn(robot: steps.Robot, say: Any) -> driving.Designed:
         say(f"exciting all wheels: {part.signal}, {part.amplitude:g} V, {part.duration:g} s")
         steps.excite(robot, [part])
     robot.processes.stop("record")
-    takes = plan.words(plan.COMPUTE * len(robot.wheels))
+    takes = plan.format_duration(plan.COMPUTE * len(robot.wheels))
     say(f"recorded {bag}; identifying, which takes about {takes}")
     results = robot.folder / "identification"
     estimates = steps.identify_wheels(bag, results, "--quiet")
     say(f"tuning, which takes about {takes}")
     gains = robot.folder / "gains.yaml"
     steps.tune_wheels(results, gains)
-    return driving.designed(estimates, gains)
+    return driving.read_designs(estimates, gains)
 
 
 def drive(
@@ -125,7 +125,7 @@ def drive(
 
     robot.client.set_parameters({controller_of(w): new for w, new in gains.items()})
     robot.switch("activate")
-    lasts = plan.words(sum(seconds for *_, seconds in DRIVE))
+    lasts = plan.format_duration(sum(seconds for *_, seconds in DRIVE))
     say(f"gains set in the running controllers; driving for {lasts}")
     drives = []
     for attempt in range(1, MAX_ATTEMPTS + 1):

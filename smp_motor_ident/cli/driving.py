@@ -39,7 +39,7 @@ class Designed:
     document: Mapping[str, Mapping[str, Any]]  # as in ``gains.json``
 
 
-def designed(estimates: Mapping[str, Estimate], gains: Path) -> Designed:
+def read_designs(estimates: Mapping[str, Estimate], gains: Path) -> Designed:
     """Return motors with the gains that ``tune`` wrote for them, a YAML file and its JSON."""
     document = json.loads(gains.with_suffix(".json").read_text("utf-8"))["wheels"]
     return Designed(estimates, applying.from_file(gains), document)
@@ -75,7 +75,7 @@ def read_drive(bag: Path, wheels: Sequence[str], namespace: str = "") -> dict[st
     }
 
 
-def moves_in(segments: Sequence[tuple[str, float, float]], answers: Table) -> list[Move]:
+def find_moves(segments: Sequence[tuple[str, float, float]], answers: Table) -> list[Move]:
     """Return the changes of one wheel's set-point in a drive by segments of name, begin and end."""
     seconds, asked = answers.seconds, answers.columns["setpoint"]
     moves = []
@@ -125,10 +125,10 @@ def changes_of(
             "sample: a clock was set meanwhile, or two nodes publish motor_state. Look at the "
             "clocks and the nodes, then drive again"
         )
-    even, speed = verification.smoothed(
+    even, speed = verification.smooth_speed(
         instants, wheel_angle(state, estimate.hardware)[shown], step
     )
-    rows = verification.predicted(
+    rows = verification.predict_speed(
         estimate, given.gains[wheel], entry["loop"], asked, (instants, waited), even
     )
     hardware = estimate.hardware
@@ -190,4 +190,4 @@ def wheel_speed(state: Table, hardware: Hardware) -> tuple[Array, Array]:
     """Return the wheel's speed as its encoder saw it."""
     angle = wheel_angle(state, hardware)
     step = float(np.median(np.diff(state.seconds)))
-    return verification.smoothed(state.seconds, angle - angle[0], step)
+    return verification.smooth_speed(state.seconds, angle - angle[0], step)

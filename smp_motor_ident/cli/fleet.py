@@ -68,7 +68,7 @@ def work(
     if not arguments.quiet:
         for mark in marks:
             what = words.put_within(mark.quantity)
-            print(f"{mark.kind}: {fleet.where(mark)}: {what} {mark.text}")
+            print(f"{mark.kind}: {fleet.name_motor(mark)}: {what} {mark.text}")
         print(f"written: {', '.join(map(str, pages))}")
     return int(any(row.failure or row.unreliable for row in rows))
 

@@ -68,7 +68,7 @@ def recordings(amplitude: float, duration: float) -> list[Recording]:
     ]
 
 
-def further(estimates: Mapping[str, Estimate], amplitude: float) -> Recording | None:
+def plan_further(estimates: Mapping[str, Estimate], amplitude: float) -> Recording | None:
     """Return the recording that would reduce the uncertainty of these estimates, or None.
 
     Open is what gains are designed from: parameters and combinations that the data give, known to
@@ -139,7 +139,7 @@ class Schedule:
         self._running = name, self._clock()
         text = f"{name}, {how}" if how else name
         number = len(self._took) + 1
-        return f"[{number}/{len(self._parts)}] {text}; about {words(self.left())} left"
+        return f"[{number}/{len(self._parts)}] {text}; about {format_duration(self.left())} left"
 
     def left(self) -> float:
         """Return the time that is left [s]."""
@@ -179,13 +179,13 @@ def schedule(
     return made
 
 
-def words(seconds: float) -> str:
+def format_duration(seconds: float) -> str:
     """Return a time to wait as a person says it."""
     whole = round(seconds / 5) * 5 if seconds > 20 else round(seconds)
     return f"{whole // 60} min {whole % 60} s" if whole >= 60 else f"{whole} s"
 
 
-def drawn(amplitude: float, duration: float, wheels: Sequence[str]) -> list[str]:
+def draw_plan(amplitude: float, duration: float, wheels: Sequence[str]) -> list[str]:
     """Return the plan in words, each signal with its first seconds as a line of blocks."""
     lines = [
         f"first: each wheel alone, some {CHECK:g} s: slowly until it turns, then at growing "
@@ -205,7 +205,7 @@ def drawn(amplitude: float, duration: float, wheels: Sequence[str]) -> list[str]
         )
         lines.append(f"  {bars}")
         begin += part.duration
-    total = words(schedule(wheels, parts).left())
+    total = format_duration(schedule(wheels, parts).left())
     accuracy = 100 * REQUIRED_ACCURACY.value
     lines += [
         f"then: identify; where a number is not known to {accuracy:g} %, one more Fourier signal "

@@ -47,7 +47,7 @@ def tune_by_relay(arguments: argparse.Namespace, files: Sequence[Path]) -> int:
 
         relay = Relay(bias, amplitude, arguments.relay_hysteresis)
         seen = oscillate(robot, wheel, relay, arguments.relay_seconds)
-    gain, period = read_oscillation(*evenly(seen))
+    gain, period = read_oscillation(*resample_evenly(seen))
     rule, structure = arguments.rule or "tyreus_luyben", arguments.structure or "pi"
     ruled = by_rule(rule, structure, gain, period)
     line = (
@@ -69,7 +69,7 @@ def tune_by_relay(arguments: argparse.Namespace, files: Sequence[Path]) -> int:
     return 0
 
 
-def evenly(answer: Mapping[str, Any]) -> tuple[list[tuple[Array, Array]], float]:
+def resample_evenly(answer: Mapping[str, Any]) -> tuple[list[tuple[Array, Array]], float]:
     """Return a recorded oscillation on even grids, cut where too many samples were lost."""
     time = np.array(answer["time"])
     if time.size < 20:

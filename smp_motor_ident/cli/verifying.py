@@ -89,7 +89,7 @@ def drive_undisturbed(
                 raise
             say(f"the drive was disturbed: {error}")
             continue
-        late = verification.disturbed(silence) or verification.slow_answers(changes)
+        late = verification.report_silence(silence) or verification.report_slow_answers(changes)
         judged = verification.judge(changes)
         if not (late and (judged or late[0].severity == "refused")):
             break

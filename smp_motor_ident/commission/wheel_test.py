@@ -94,7 +94,7 @@ def answers_well(level: float, breakaway: float, counts: float) -> bool:
     return level * MAX_FRICTION_SHARE.value >= breakaway and counts >= MIN_RESPONSE_COUNTS.value
 
 
-def settled(hold: Trace) -> bool:
+def has_settled(hold: Trace) -> bool:
     """Tell whether a wheel turned as far in the last third of a held voltage as in the second.
 
     Thirds of the time of the reported voltage, because a busy computer takes samples in bunches.
@@ -156,7 +156,9 @@ def figures(trace: Trace, phases: Sequence[Phase], hardware: Hardware) -> Figure
     )
 
 
-def moved_with(traces: Mapping[str, Trace], phases: Sequence[Phase]) -> dict[str, dict[str, float]]:
+def count_coupled_motion(
+    traces: Mapping[str, Trace], phases: Sequence[Phase]
+) -> dict[str, dict[str, float]]:
     """Return by driven wheel how far every wheel turned meanwhile [counts]."""
     found: dict[str, dict[str, float]] = {}
     for driven in dict.fromkeys(p.wheel for p in phases):

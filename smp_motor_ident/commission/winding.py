@@ -78,7 +78,7 @@ def resistance(record: Record) -> Resistance | None:
     )
 
 
-def heated(wheel: str, earlier: Sequence[Record], last: Record) -> list[Finding]:
+def report_heated_winding(wheel: str, earlier: Sequence[Record], last: Record) -> list[Finding]:
     """Return whether a winding is too much hotter than in the earlier recording with the most
     accurate resistance.
     """

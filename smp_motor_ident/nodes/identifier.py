@@ -143,7 +143,7 @@ class Wheel:
 
     def _on_description(self, message: MotorDescription) -> None:
         self.joint_name = message.joint_name or self.joint_name
-        self.window.hardware = read.described(message)
+        self.window.hardware = read.convert_description(message)
 
     def tell(self, status: str, found: Estimate | None = None) -> None:
         self.status = status

@@ -18,7 +18,7 @@ from rosgraph_msgs.msg import Clock
 from smp_motor_control.errors import SmpError
 from smp_motor_control.nodes import runtime
 from smp_motor_control.ros_arguments import split_arguments
-from smp_motor_ident.bag.replay import Replay, offered
+from smp_motor_ident.bag.replay import Replay, find_offered_qos
 from smp_motor_ident.bag.storage import Channel
 from smp_motor_ident.nodes.bag_arguments import chosen, message_class, quality
 
@@ -66,7 +66,7 @@ class Player(Node):
                 why = f"its messages are encoded as {channel.encoding}"
             self.get_logger().warning(f"{channel.topic} is not played: {why}")
             return
-        qos = quality(DEPTH, *offered(channel))
+        qos = quality(DEPTH, *find_offered_qos(channel))
         publisher = self.create_publisher(message, channel.topic, qos)
         self._outputs[channel.topic] = (channel.type, publisher)
 

@@ -48,7 +48,7 @@ class Mark:
     text: str  # in words, with the numbers
 
 
-def where(row: Row | Mark) -> str:
+def name_motor(row: Row | Mark) -> str:
     """Return whose motor it is."""
     return f"{row.robot}, {words.put_within(row.wheel)}" if row.wheel else row.robot
 
@@ -188,5 +188,5 @@ def page(rows: Sequence[Row], marks: Sequence[Mark]) -> str:
         undated=count(lambda r: r.date is None and not r.failure),
         failed=count(lambda r: bool(r.failure)),
         words=words,
-        where=where,
+        where=name_motor,
     )

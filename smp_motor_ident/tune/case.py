@@ -11,25 +11,30 @@ from smp_motor_ident.chain.terminal import Driver, driver_of, put_out
 from smp_motor_ident.errors import DesignError
 from smp_motor_ident.finding import Finding
 from smp_motor_ident.result import Estimate
-from smp_motor_ident.tune.ensemble import Robustness, UncertaintyEnsemble, back_off, softer
+from smp_motor_ident.tune.ensemble import (
+    Robustness,
+    UncertaintyEnsemble,
+    back_off,
+    reduce_crossover,
+)
 from smp_motor_ident.tune.feedback import Feedback
 from smp_motor_ident.tune.loop import Loop
 from smp_motor_ident.tune.methods import METHODS
 from smp_motor_ident.tune.motors import (
     Friction,
+    alternate_motors,
     draw_motors,
-    every_other,
     friction_of,
-    lag_in_sensor,
-    lag_of_sensor,
     motors_of,
+    move_lag_to_sensor,
     outliers_of,
+    report_sensor_lag,
     torque_noise_of,
     unreliable_spread,
 )
 from smp_motor_ident.tune.plant import sample
-from smp_motor_ident.tune.problem import Method, Problem, RequiredMargins, checked
-from smp_motor_ident.tune.unmodelled import unmodelled_dynamics, words
+from smp_motor_ident.tune.problem import Method, Problem, RequiredMargins, check_target
+from smp_motor_ident.tune.unmodelled import describe_known_band, unmodelled_dynamics
 
 MAX_CONTROL_NOISE = 1 / 6
 """Largest control noise [share of the supply, rms] of any gains: three times it is half of the
@@ -92,7 +97,7 @@ def prepare(estimate: Estimate, loop: Loop, method: str, targets: dict[str, Any]
     )
     loop = _limit_by_driver(driver, loop)
     friction = friction_of(estimate, loop.supply_voltage)
-    lag = lag_of_sensor(estimate) if loop.reports_speed else None
+    lag = report_sensor_lag(estimate) if loop.reports_speed else None
     level = next((f for f in estimate.findings if f.code == "one_size_of_voltage"), None)
     findings += [one for one in (friction.finding, lag, level) if one is not None]
     # The reference leaves room for all of it.
@@ -101,14 +106,14 @@ def prepare(estimate: Estimate, loop: Loop, method: str, targets: dict[str, Any]
     plant = sample(replace(motors_of(estimate), static_voltage=np.array([lost])), loop)
     problem = Problem(plant, loop, targets, unmodelled_dynamics(estimate))
     required = _required(chosen, problem)
-    n = int(checked(targets, "samples") or 1000)
-    seed = int(checked(targets, "seed", least=-1) or 0)
+    n = int(check_target(targets, "samples") or 1000)
+    seed = int(check_target(targets, "seed", least=-1) or 0)
     # Eigenvalues cost with the cube of the states: fewer motors where a loop has many.
     states = plant.taps.shape[1] + plant.window + 6
     n = max(min(n, int(WORK / states**3)), MIN_DRAWS)
     motors = draw_motors(estimate, n, np.random.default_rng(seed), friction)
     if motors is not None and lag is not None:
-        motors = every_other(motors, lag_in_sensor(motors))
+        motors = alternate_motors(motors, move_lag_to_sensor(motors))
     draws = plant if motors is None else sample(motors, loop, believed=plant.motors)
     ensemble = UncertaintyEnsemble(draws, required, problem)
     if motors is None:
@@ -170,12 +175,12 @@ def solve(case: Case) -> tuple[Feedback, float, Robustness]:
     feedback, factor, robustness = back_off(case.ensemble.assess, quiet)
     factor *= calm
     if factor == 0.0:
+        known = describe_known_band(case.problem.unmodelled)
         raise DesignError(
             f"{case.wheel}: no gains of this kind keep a phase margin of "
             f"{case.required.phase:g} deg and Ms {case.required.sensitivity:g} for 99 % of the "
-            f"motors "
-            f"within the uncertainty (for {100 * robustness.holds:.0f} %)"
-            f"{words(case.problem.unmodelled)}; record more, or ask for smaller margins"
+            f"motors within the uncertainty (for {100 * robustness.holds:.0f} %){known}; record "
+            "more, or ask for smaller margins"
         )
     return feedback, factor, robustness
 
@@ -188,7 +193,7 @@ def _within_clamp(problem: Problem, feedback: Feedback) -> tuple[Feedback, float
         and factor > 0.01
     ):
         factor *= 0.95
-        trial = softer(feedback, factor)
+        trial = reduce_crossover(feedback, factor)
     return trial, factor
 
 

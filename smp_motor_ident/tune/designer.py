@@ -25,13 +25,13 @@ from smp_motor_ident.tune.limits import (
 from smp_motor_ident.tune.loop import Loop
 from smp_motor_ident.tune.margins import Margins, loop_margins
 from smp_motor_ident.tune.methods import METHODS
-from smp_motor_ident.tune.motors import Motors, lag_in_sensor
+from smp_motor_ident.tune.motors import Motors, move_lag_to_sensor
 from smp_motor_ident.tune.plant import Plant, sample
 from smp_motor_ident.tune.reference import Reference, controller_for, plan_reference
 from smp_motor_ident.tune.simulation import Controller
 from smp_motor_ident.tune.specification import Performance, Settling, Specification, figures_of
 from smp_motor_ident.tune.unmodelled import UnmodelledDynamics
-from smp_motor_ident.tune.unmodelled import words as known_words
+from smp_motor_ident.tune.unmodelled import describe_known_band as known_words
 
 
 @dataclass(frozen=True)
@@ -217,7 +217,7 @@ def _plan(case: Case, controller: Controller, margins: Margins) -> Reference:
     loop, usual = case.problem.loop, _sample_usual(case)
     plants = [usual]
     if case.lag_in_doubt:
-        plants.append(_sample_usual(case, lag_in_sensor(usual.motors)))
+        plants.append(_sample_usual(case, move_lag_to_sensor(usual.motors)))
     # Require no more tolerance of additional delay than the loop can have.
     doubt = max(loop.delay_doubt, case.scatter)
     borne = replace(loop, delay_doubt=min(doubt, MAX_DELAY_SHARE.value * margins.delay))

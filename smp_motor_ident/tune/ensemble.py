@@ -82,7 +82,7 @@ def back_off(
     good, bad = None, 1.0
     factor = 0.97
     while factor > 0.01:
-        trial = softer(feedback, factor)
+        trial = reduce_crossover(feedback, factor)
         found = assess(trial)
         if found.holds >= REQUIRED_SHARE:
             good = factor, trial, found
@@ -92,7 +92,7 @@ def back_off(
         return feedback, 0.0, assess(feedback)
     for _ in range(6):
         middle = 0.5 * (good[0] + bad)
-        trial = softer(feedback, middle)
+        trial = reduce_crossover(feedback, middle)
         found = assess(trial)
         if found.holds >= REQUIRED_SHARE:
             good = middle, trial, found
@@ -101,6 +101,6 @@ def back_off(
     return good[1], good[0], good[2]
 
 
-def softer(feedback: Feedback, factor: float) -> Feedback:
+def reduce_crossover(feedback: Feedback, factor: float) -> Feedback:
     """Return gains with a lower crossover and the same shape of the loop."""
     return replace(feedback.scaled(factor), i=feedback.i * factor**2)

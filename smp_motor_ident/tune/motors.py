@@ -166,7 +166,7 @@ def _hidden_lag(estimate: Estimate) -> tuple[float, float] | None:
     return low, max(low, min(high, 0.25 * estimate.value("time_constant") ** 2))
 
 
-def lag_of_sensor(estimate: Estimate) -> Finding | None:
+def report_sensor_lag(estimate: Estimate) -> Finding | None:
     """Return a finding where the second lag may be the reported speed's filter."""
     causes = {s.cause for q in estimate.combinations.values() for s in q.systematic}
     if "low_passed_speed" not in causes:
@@ -200,7 +200,7 @@ def outliers_of(estimate: Estimate) -> float:
     return sum(float(f.evidence["samples"] or 0.0) for f in found) / max(estimate.samples, 1)
 
 
-def lag_in_sensor(motors: Motors) -> Motors:
+def move_lag_to_sensor(motors: Motors) -> Motors:
     """Return motors with the second lag as the reported speed's filter.
 
     The response from voltage to reported speed is the same; two lags that would be complex because
@@ -216,7 +216,7 @@ def lag_in_sensor(motors: Motors) -> Motors:
     )
 
 
-def every_other(motors: Motors, others: Motors) -> Motors:
+def alternate_motors(motors: Motors, others: Motors) -> Motors:
     """Return a batch in which every other motor is one of ``others``."""
     other = np.arange(len(motors)) % 2 == 1
     pairs = ((f.name, getattr(motors, f.name), getattr(others, f.name)) for f in fields(motors))
@@ -232,7 +232,7 @@ def _covariance(estimate: Estimate, names: tuple[str, ...], mean: Array) -> Arra
     for one in estimate.systematic:
         if (
             one.cause != "low_passed_speed"
-        ):  # `lag_in_sensor` draws which of the two lags is the motor's
+        ):  # `move_lag_to_sensor` draws which of the two lags is the motor's
             move = np.array([one.moves.get(name, 0.0) for name in names])
             covariance += np.outer(move, move)
     spread = np.zeros(len(names))

@@ -130,7 +130,7 @@ class Problem:
 
     def target(self, name: str, default: float, *, least: float = 0.0) -> float:
         """Return a numeric target, checked."""
-        value = checked(self.targets, name, least)
+        value = check_target(self.targets, name, least)
         return default if value is None else value
 
     @property
@@ -142,7 +142,7 @@ class Problem:
         return str(value or "")
 
 
-def checked(targets: Mapping[str, Any], name: str, least: float = 0.0) -> float | None:
+def check_target(targets: Mapping[str, Any], name: str, least: float = 0.0) -> float | None:
     """Return a numeric target, or None where it is not given."""
     value = targets.get(name)
     if value is None:

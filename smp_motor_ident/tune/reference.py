@@ -29,7 +29,7 @@ from smp_motor_ident.errors import DesignError
 from smp_motor_ident.tune.feedback import Feedback
 from smp_motor_ident.tune.loop import Loop
 from smp_motor_ident.tune.plant import Plant, sample
-from smp_motor_ident.tune.problem import checked, measured_lag
+from smp_motor_ident.tune.problem import check_target, measured_lag
 from smp_motor_ident.tune.simulation import Controller, Inputs, simulate, step_figures
 
 STEADY_VOLTAGE_SHARE = 0.92
@@ -147,9 +147,9 @@ def plan_reference(
     """
     plant = plants[0]
     ratio = loop.gear_ratio
-    asked = (checked(targets, name) for name in ("max_velocity", "max_acceleration"))
+    asked = (check_target(targets, name) for name in ("max_velocity", "max_acceleration"))
     speed, rate = (None if one is None else one * ratio for one in asked)
-    duration = checked(targets, "transition_time")
+    duration = check_target(targets, "transition_time")
     m = plant.motors
     plan = Reference(
         max_velocity=_reachable(plant, loop, speed),

@@ -64,7 +64,10 @@ def added_by_resonance(
     complementary, moved = _loop(plant, feedback, omega, usual)
     ends, highest = [settling_time(time, usual)], usual.max()
     for damping in DAMPINGS:
-        error = mode(omega, at, damping, T) * largest(unmodelled, at, damping, T)[:, None]
+        error = (
+            compute_modes(omega, at, damping, T)
+            * find_largest_modes(unmodelled, at, damping, T)[:, None]
+        )
         for D in (error, -error):
             spectrum = np.pad(D * moved / (1 + D * complementary), ((0, 0), (1, 0)))
             rows = usual + np.fft.irfft(spectrum, n)
@@ -73,7 +76,7 @@ def added_by_resonance(
     return float(highest - usual.max()), float(np.max(ends) - ends[0])
 
 
-def mode(omega: Array, at: Array, damping: float, sample_time: float) -> Complex:
+def compute_modes(omega: Array, at: Array, damping: float, sample_time: float) -> Complex:
     """Return ``s^2 / (s^2 + 2 z w s + w^2)`` over frequencies, a row for each w [rad/s].
 
     Sampled by Tustin's rule prewarped at w, so that it is causal.
@@ -83,11 +86,13 @@ def mode(omega: Array, at: Array, damping: float, sample_time: float) -> Complex
     return response
 
 
-def largest(unmodelled: UnmodelledDynamics, at: Array, damping: float, sample_time: float) -> Array:
+def find_largest_modes(
+    unmodelled: UnmodelledDynamics, at: Array, damping: float, sample_time: float
+) -> Array:
     """Return the largest m, up to 1, for which modes stay within the bound."""
     ends = unmodelled.frequency[0], np.pi / sample_time
     omega = np.union1d(np.geomspace(*ends, 10 * FREQUENCY_COUNT), at)
-    size = np.abs(mode(omega, at, damping, sample_time))
+    size = np.abs(compute_modes(omega, at, damping, sample_time))
     m: Array = np.minimum((unmodelled.weight(omega) / size).min(axis=1), 1.0)
     return m
 

@@ -60,7 +60,7 @@ class Inputs:
     angle_noise: Array | None = None  # [rad]: on the angle that it is made from, shape (n, k)
 
 
-def white(
+def draw_white_noise(
     deviation: float, shape: tuple[int, int], seed: int = 0, of: NDArray[np.bool_] | None = None
 ) -> Array | None:
     """Return reproducible white noise ``of`` some motors or all; None without noise."""
@@ -263,7 +263,7 @@ class StepFigures:
     peak_voltage: float  # largest magnitude [V]
 
 
-def settled(time: Array, outside: NDArray[np.bool_]) -> float:
+def find_last_exit(time: Array, outside: NDArray[np.bool_]) -> float:
     """Return when a signal is outside of its band no more; NaN where it is at the end."""
     last = int(np.flatnonzero(outside)[-1]) if np.any(outside) else -1
     return float(time[last + 1]) if last + 1 < time.size else math.nan
@@ -271,7 +271,7 @@ def settled(time: Array, outside: NDArray[np.bool_]) -> float:
 
 def settling_time(time: Array, answer: Array, tolerance: float = SETTLING_BAND.value) -> float:
     """Return when the answer to a unit change stays within a tolerance of 1; NaN where never."""
-    return settled(time, np.abs(answer - 1.0) > tolerance)
+    return find_last_exit(time, np.abs(answer - 1.0) > tolerance)
 
 
 def step_figures(time: Array, speed: Array, voltage: Array, final: float) -> StepFigures:

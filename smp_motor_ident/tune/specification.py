@@ -24,10 +24,10 @@ from smp_motor_ident.tune.simulation import (
     Controller,
     Inputs,
     StepFigures,
-    settled,
+    draw_white_noise,
+    find_last_exit,
     simulate,
     step_figures,
-    white,
 )
 
 
@@ -160,7 +160,7 @@ def _runs(
             forward=forward,
             load=_draw_loads(case, plant.motors.static_voltage, shape) + late * _change(forward),
             noise=_reported_noise(case, loop, shape) + late * _change(plan.reference),
-            angle_noise=white(loop.angle_noise, shape, of=counted),
+            angle_noise=draw_white_noise(loop.angle_noise, shape, of=counted),
         ),
         count_angle=np.where(counted, loop.count_angle, 0.0),
         speed_step=loop.rounding,
@@ -198,7 +198,7 @@ def _draw_loads(case: Case, friction: Array, shape: tuple[int, int]) -> Array:
     end.
     """
     either = np.where(np.arange(shape[0]) // 2 % 2, -1.0, 1.0)
-    noise = white(case.torque_noise, shape, 1)
+    noise = draw_white_noise(case.torque_noise, shape, 1)
     held: Array = np.broadcast_to((either * np.minimum(case.load, friction))[:, None], shape)
     return held if noise is None else held + noise
 
@@ -219,7 +219,7 @@ def _reported_noise(case: Case, loop: Loop, shape: tuple[int, int]) -> Array | f
     They have any size up to the top speed; the loop rejects changes impossible for a motor.
     """
     rounding = loop.rounding**2 / 12
-    noise = white(math.sqrt(max(loop.reported_noise**2 - rounding, 0.0)), shape)
+    noise = draw_white_noise(math.sqrt(max(loop.reported_noise**2 - rounding, 0.0)), shape)
     if noise is None or not case.outliers:
         return 0.0 if noise is None else noise
     motor = case.problem.plant.motors
@@ -251,7 +251,7 @@ def _performance(
         step_overshoot=abrupt.overshoot,
         load_peak=float(loss.max()),
         load_integral=float(np.trapezoid(loss, time)),
-        load_recovery=settled(time, loss > 0.1 * loss.max()),
+        load_recovery=find_last_exit(time, loss > 0.1 * loss.max()),
         peak_voltage=planned.peak_voltage,
         control_noise=control_noise,
     )

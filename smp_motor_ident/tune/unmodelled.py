@@ -68,7 +68,7 @@ def unmodelled_dynamics(estimate: Estimate) -> UnmodelledDynamics | None:
     return UnmodelledDynamics(np.array(error.frequency), taken)
 
 
-def words(unmodelled: UnmodelledDynamics | None, before: str = "; ") -> str:
+def describe_known_band(unmodelled: UnmodelledDynamics | None, before: str = "; ") -> str:
     """Return up to where the response is known, to be put behind other words."""
     if unmodelled is None or not math.isfinite(unmodelled.known):
         return ""

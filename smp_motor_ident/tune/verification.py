@@ -86,7 +86,7 @@ class Change:
     excess: float  # overshoot of the nominal motor beyond the design's [% of the change]
 
 
-def smoothed(time: Array, angle: Array, step: float) -> tuple[Array, Array]:
+def smooth_speed(time: Array, angle: Array, step: float) -> tuple[Array, Array]:
     """Return instants at an even distance and the speed there, from angles at any."""
     even = np.arange(time[0], time[-1], step)
     window = max(2 * round(SMOOTHING_S / step / 2) + 1, 5)
@@ -152,7 +152,7 @@ def arrival_delays(
     return np.where((first < time.size) & matched, np.maximum(ages, begun - asked), usual)
 
 
-def predicted(
+def predict_speed(
     estimate: Estimate,
     parameters: Mapping[str, Any],
     loop: Mapping[str, Any],
@@ -173,7 +173,7 @@ def predicted(
     for k, entry in enumerate(_motors(estimate, float(loop["supply_voltage"]))):
         phase = k / (1 + DRAWS)  # of a count; which it was nobody knows
         angle = _run(entry, settings, setpoints, instants, delays, phase)
-        even, speed = smoothed(instants, angle, step)
+        even, speed = smooth_speed(instants, angle, step)
         rows.append(np.interp(time, even, speed))
     return np.array(rows)
 
@@ -207,10 +207,10 @@ def _run(
 def bands_of(
     rows: Array, time: Array, setpoint: float, specification: Mapping[str, Any], unsure: float
 ) -> Reading:
-    """Return the widest that the design and the motors that may be allow.
+    """Return the largest readings within the design and the uncertainty of the motor.
 
-    Simulations (as :func:`predicted` returns them) count as prediction limits; what sampling and
-    the resolution of the speed, ``unsure`` [rad/s], add comes on top.
+    Simulations, as :func:`predict_speed` returns them, give prediction limits; the effects of
+    sampling and of the resolution of the speed, ``unsure`` [rad/s], are added.
     """
     margin = RESOLUTION_SIGMAS * unsure / abs(setpoint)
     simulated = [read(time, row, setpoint, SETTLING_BAND.value + margin) for row in rows]
@@ -288,7 +288,7 @@ def judge(changes: Sequence[Change]) -> list[Finding]:
     return found
 
 
-def slow_answers(changes: Sequence[Change]) -> list[Finding]:
+def report_slow_answers(changes: Sequence[Change]) -> list[Finding]:
     """Report overshoot caused by the drive's own timing, for which the bands allow."""
     worst = max(changes, key=lambda one: one.excess)
     if worst.excess <= 0.0:
@@ -300,7 +300,7 @@ def slow_answers(changes: Sequence[Change]) -> list[Finding]:
     return [Finding("slow_answers", "warning", text, {"excess": worst.excess}, _TIME)]
 
 
-def disturbed(silence: float) -> list[Finding]:
+def report_silence(silence: float) -> list[Finding]:
     """Return the finding where a wheel was without control for a while [s]."""
     if silence <= MAX_SILENCE.value:
         return []

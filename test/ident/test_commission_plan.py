@@ -92,12 +92,12 @@ class Steps:
         self.bounds, self.sent = dict[str, object](), list[Any]()
         self.more: plan.Recording | None = None
         self.estimate = make_estimate("left")
-        monkeypatch.setattr(plan, "further", lambda *_: self.more)
+        monkeypatch.setattr(plan, "plan_further", lambda *_: self.more)
         monkeypatch.setattr(commissioning, "connect", self.connect)
         monkeypatch.setattr(steps, "record", self.record)
         for owner, name, called in (
             (steps, "excite", "excite"),
-            (commissioning, "validate", "validated"),
+            (commissioning, "validate", "validate_motors"),
             (commissioning, "verify", "_verify"),
         ):
             monkeypatch.setattr(owner, called, partial(self.step, name))
@@ -326,15 +326,15 @@ def test_the_remaining_time_follows_the_duration_of_similar_parts() -> None:
     assert timed.left() == 25.0 + 10.0  # b is late as a was, c is of another kind
     now[0] = 30.0
     assert timed.left() == 20.0 + 10.0
-    assert plan.words(30.4) == "30 s" and plan.words(123.0) == "2 min 5 s"
+    assert plan.format_duration(30.4) == "30 s" and plan.format_duration(123.0) == "2 min 5 s"
 
 
 def test_a_motor_that_is_not_known_well_enough_is_recorded_once_more() -> None:
     known = make_estimate()  # to a percent, and the gain better
-    assert plan.further({"left": known}, 6.0) is None
+    assert plan.plan_further({"left": known}, 6.0) is None
     vague = replace(known.combinations["time_constant"], std=0.002)  # 5 %
     open_ = replace(known, combinations={**known.combinations, "time_constant": vague})
-    more = plan.further({"left": known, "right": open_}, 6.0)
+    more = plan.plan_further({"left": known, "right": open_}, 6.0)
     assert more is not None and more.folder == "excitation" and more.name == "further"
     sent = more.excitation
     assert sent.signal == "fourier" and sent.amplitude <= 6.0 and sent.band is not None

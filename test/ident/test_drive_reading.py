@@ -32,7 +32,7 @@ def test_a_drive_settles_as_tune_predicts(tmp_path: Path) -> None:
     motors = find_paper_motors()
     gains = tmp_path / "gains.yaml"
     assert tune.main([str(motors), "--output", str(gains), "--supply", "12"]) == 0
-    given = driving.designed(read_estimates(motors), gains)
+    given = driving.read_designs(read_estimates(motors), gains)
     stated = json.loads((tmp_path / "gains.json").read_text())["wheels"][WHEEL]["settling"]
     assert stated["common"]  # four wheels, one transition
 
@@ -53,7 +53,7 @@ def test_a_drive_settles_as_tune_predicts(tmp_path: Path) -> None:
     answers = table(run.time, setpoint=setpoints, output=none, age=steps, dt=steps)
     # A segment begins when it is sent, 12 ms before the wheel hears of it.
     segments = [(name, k * LASTS - 0.012, (k + 1) * LASTS) for k, (name, _) in enumerate(SEGMENTS)]
-    moves = driving.moves_in(segments, answers)
+    moves = driving.find_moves(segments, answers)
     assert [(m.name, m.before, m.setpoint) for m in moves] == [
         ("straight", 0.0, 2.0), ("arc", 2.0, 1.0), ("spin", 1.0, -2.0), ("stop", -2.0, 0.0),
     ]  # fmt: skip

@@ -19,7 +19,7 @@ from smp_motor_ident.report.document import identification_document, read_identi
 from smp_motor_ident.tune import Loop, design
 from smp_motor_ident.tune.case import prepare
 from smp_motor_ident.tune.feedback import Feedback
-from smp_motor_ident.tune.simulation import Controller, Inputs, simulate, white
+from smp_motor_ident.tune.simulation import Controller, Inputs, draw_white_noise, simulate
 from smp_motor_ident.tune.source import choose_source
 
 T, GAIN, TAU, NOISE, SUPPLY = 5e-4, 20.0, 0.1, 3e-3, 12.0
@@ -111,7 +111,7 @@ def test_simulated_noise_of_an_angle_is_that_of_the_density(found, source, windo
     problem = prepare(found, loop, "margin", {"samples": 50}).problem
     feedback = Feedback(0.05, 0.3)
     steps = 40_000
-    inputs = Inputs(np.zeros(steps), angle_noise=white(NOISE, (1, steps)))
+    inputs = Inputs(np.zeros(steps), angle_noise=draw_white_noise(NOISE, (1, steps)))
     run = simulate(problem.plant, Controller(feedback), inputs)
     # The observer's noise is slow: some 2000 of the samples are independent, 3 % is two deviations.
     assert run.voltage.std() == pytest.approx(problem.control_noise(feedback), rel=0.05)

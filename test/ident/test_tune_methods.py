@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from smp_motor_ident.cli.relaying import evenly
+from smp_motor_ident.cli.relaying import resample_evenly
 from smp_motor_ident.errors import DesignError
 from smp_motor_ident.tune.feedback import Feedback, closed_loop
 from smp_motor_ident.tune.loop import Loop
@@ -130,12 +130,12 @@ def test_relay_feedback_tolerates_lost_samples():
         "speed": speed[kept].tolist(),
         "angle": (0.005 * np.cumsum(speed))[kept].tolist(),
     }
-    gain, period = read_oscillation(*evenly(answer))
+    gain, period = read_oscillation(*resample_evenly(answer))
     whole = read_oscillation([(voltage, speed)], 0.005)
     # One sample of twenty is a straight line between its neighbours, a twelfth of a period apart.
     assert (gain, period) == pytest.approx(whole, rel=0.05)
     # Without the voltage that acted, the one that was asked for tells nearly the same.
-    asked = read_oscillation(*evenly({**answer, "applied": [np.nan] * kept.sum()}))
+    asked = read_oscillation(*resample_evenly({**answer, "applied": [np.nan] * kept.sum()}))
     assert asked == pytest.approx(whole, rel=0.05)
 
 
@@ -148,7 +148,7 @@ def test_relay_is_evaluated_between_pauses_of_its_computer():
     kept = time % (5.4 * period) < 5 * period
     answer = {"time": time, "voltage": voltage, "applied": np.roll(voltage, 2), "speed": speed}
     answer = {name: x[kept] for name, x in {**answer, "angle": 0.005 * np.cumsum(speed)}.items()}
-    stretches, step = evenly(answer)
+    stretches, step = resample_evenly(answer)
     with pytest.raises(DesignError, match="steady cycles"):
         read_oscillation(stretches[:1], step)
     whole = read_oscillation([(voltage, speed)], 0.005)
@@ -157,7 +157,7 @@ def test_relay_is_evaluated_between_pauses_of_its_computer():
 
 def test_relay_without_samples_is_told():
     with pytest.raises(DesignError, match="only 1 samples"):
-        evenly({key: [0.0] for key in ("time", "voltage", "applied", "speed", "angle")})
+        resample_evenly({key: [0.0] for key in ("time", "voltage", "applied", "speed", "angle")})
 
 
 def test_relay_that_does_not_oscillate_is_told():

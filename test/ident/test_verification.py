@@ -54,9 +54,9 @@ def drive(
     # Zero is the first sample that saw the new set-point.
     instants = run.time - run.time[run.time >= REST][0]
     turn = entry.gearbox.to_wheel(entry.encoder.angle_per_count)
-    even, speed = v.smoothed(instants, turn * run.count, STEP)
+    even, speed = v.smooth_speed(instants, turn * run.count, STEP)
     kept = even >= 0.0
-    rows = v.predicted(
+    rows = v.predict_speed(
         ESTIMATE,
         parameters(one),
         document,
@@ -92,7 +92,7 @@ def test_samples_that_nobody_answered_are_in_the_prediction(designed: Design) ->
     silent = np.where((instants > 0.05) & (instants < 0.11), np.nan, 0.0)
     setpoints = np.where(instants < 0.0, 0.0, 1.0)
     rows = [
-        v.predicted(
+        v.predict_speed(
             ESTIMATE, parameters(designed), loop, setpoints, (instants, ages), instants[60:230]
         )[0]
         for ages in (np.zeros(instants.size), silent)
@@ -122,12 +122,12 @@ def test_what_the_integral_keeps_from_one_change_to_the_next_is_in_the_predictio
         drive=DriveSettings(command_timeout=math.inf, pwm_steps=1000),
     )  # fmt: skip
     turn = ENTRY.gearbox.to_wheel(ENTRY.encoder.angle_per_count)
-    even, speed = v.smoothed(run.time, turn * run.count, STEP)
+    even, speed = v.smooth_speed(run.time, turn * run.count, STEP)
     estimate = replace(ESTIMATE, combinations=known)
     loop = {"sample_time": STEP, "delay": STEP, "supply_voltage": 12.0}
     setpoints = np.array([asked(t) for t in run.time])
     answers = (run.time, np.full(run.time.size, STEP))
-    row = v.predicted(estimate, parameters(designed), loop, setpoints, answers, even)[0]
+    row = v.predict_speed(estimate, parameters(designed), loop, setpoints, answers, even)[0]
     assert np.abs(row - speed).max() < 0.02 * setpoint
 
 
@@ -168,9 +168,9 @@ def test_a_drive_that_its_computer_slowed_is_within_its_bands_and_says_so(design
     slow = drive(designed, wait=0.03)
     assert slow.reading.overshoot > 10.0
     assert v.judge([slow]) == []
-    (found,) = v.slow_answers([slow, drive(designed)])
+    (found,) = v.report_slow_answers([slow, drive(designed)])
     assert found.severity == "warning" and found.evidence["excess"] == slow.excess
-    assert v.slow_answers([drive(designed)]) == []
+    assert v.report_slow_answers([drive(designed)]) == []
     # Where it is beyond even that, the computer is named, not the wheel.
     (refused,) = v.judge([replace(slow, bands=replace(slow.bands, overshoot=1.0))])
     assert refused.advice == found.advice != v.judge([drive(designed, offset=-0.05)])[0].advice
@@ -203,8 +203,8 @@ def test_a_wheel_that_never_arrives_is_refused_in_words(designed: Design) -> Non
 
 
 def test_a_drive_without_control_is_refused_with_its_reason() -> None:
-    assert v.disturbed(0.09) == []
-    (found,) = v.disturbed(0.4)
+    assert v.report_silence(0.09) == []
+    (found,) = v.report_silence(0.4)
     assert found.severity == "refused" and "0.40 s" in found.message and found.advice
 
 
@@ -213,6 +213,6 @@ def test_the_resolution_of_a_speed_is_that_of_its_parabola() -> None:
     quantum, speed = 0.01, 0.37
     time = np.arange(0.0, 20.0, STEP)
     angle = quantum * np.floor(speed * time / quantum)
-    _, slope = v.smoothed(time, angle, STEP)
+    _, slope = v.smooth_speed(time, angle, STEP)
     # Errors of a staircase repeat and are not independent: to a factor of two.
     assert 0.5 < np.std(slope[20:-20]) / v.resolution(quantum, STEP) < 2.0

@@ -16,9 +16,9 @@ from smp_motor_ident.commission.wheel_test import (
     Phase,
     Trace,
     answers_well,
+    count_coupled_motion,
     figures,
-    moved_with,
-    settled,
+    has_settled,
 )
 from smp_motor_ident.record import Hardware
 
@@ -126,10 +126,10 @@ def test_a_wheel_that_does_not_turn_is_refused_by_name() -> None:
 def test_plugs_of_two_wheels_that_are_exchanged_are_separated_from_a_belt() -> None:
     (seen, phases), (still, _) = trace(), trace(driven=False)
     # Commands to the left turn the right.
-    moved = moved_with({"left": still, "right": seen}, phases)
+    moved = count_coupled_motion({"left": still, "right": seen}, phases)
     robot = Robot({"left": GOOD, "right": GOOD}, dict.fromkeys(("left", "right"), HARDWARE), moved)
     assert "crossed_wheels" in {f.code for f in judge(robot)}
-    moved = moved_with({"left": seen, "right": seen}, phases)
+    moved = count_coupled_motion({"left": seen, "right": seen}, phases)
     robot = Robot({"left": GOOD, "right": GOOD}, dict.fromkeys(("left", "right"), HARDWARE), moved)
     assert {f.code: f.severity for f in judge(robot)}["coupled_wheels"] == "warning"
 
@@ -208,12 +208,12 @@ def test_samples_that_wait_in_a_queue_show_the_same_motor() -> None:
 def test_a_wheel_has_not_settled_while_samples_are_of_the_voltage_before() -> None:
     seen, phases = trace()
     first, second = (seen.during(p.number) for p in phases if p.kind == "hold" and p.level > 2.0)
-    assert settled(first)
+    assert has_settled(first)
     begun = Trace.of(np.concatenate([_rows(first), _rows(second)[:20]]))
-    assert not settled(begun)
-    assert settled(Trace.of(np.concatenate([_rows(first), _rows(second)])))
+    assert not has_settled(begun)
+    assert has_settled(Trace.of(np.concatenate([_rows(first), _rows(second)])))
     # As long as a computer is busy these are all that there are.
-    assert not settled(replace(first, command=second.command[: first.command.size]))
+    assert not has_settled(replace(first, command=second.command[: first.command.size]))
 
 
 def test_a_coast_begins_when_the_voltage_is_gone() -> None:
@@ -233,7 +233,7 @@ def test_samples_that_come_in_bunches_settle_nothing() -> None:
     columns = [np.ones(time.size)] * 8
     rows = np.stack(columns, axis=1)
     rows[:, 0], rows[:, 6] = time, count
-    assert not settled(Trace.of(rows))
+    assert not has_settled(Trace.of(rows))
 
 
 def _rows(part: Trace) -> np.ndarray:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from independent import simulate
 
-from smp_motor_ident.commission.winding import heated, resistance
+from smp_motor_ident.commission.winding import report_heated_winding, resistance
 from smp_motor_ident.record import Record
 
 R, L, K, J, B, TC = 3.2, 2e-3, 0.03, 1.4e-5, 5.5e-5, 2e-3
@@ -39,7 +39,7 @@ def test_the_resistance_of_a_recording_is_the_windings_whatever_the_friction(
 
 @pytest.mark.parametrize("rise", [0.3, 0.5])
 def test_a_winding_that_heats_ends_the_commissioning(rise: float) -> None:
-    (finding,) = heated("left", [signal(0.0, 1)], signal(rise, 2))
+    (finding,) = report_heated_winding("left", [signal(0.0, 1)], signal(rise, 2))
     assert finding.code == "winding_hot" and finding.severity == "refused"
     assert finding.evidence["warmer"] == pytest.approx(rise / 0.00393, rel=0.1)
     assert "--resume" in finding.advice
@@ -47,13 +47,13 @@ def test_a_winding_that_heats_ends_the_commissioning(rise: float) -> None:
 
 @pytest.mark.parametrize("seed", range(20))
 def test_a_winding_that_warms_as_motors_do_does_not(seed: int) -> None:
-    assert not heated("left", [signal(0.0, seed)], signal(0.1, 100 + seed))
+    assert not report_heated_winding("left", [signal(0.0, seed)], signal(0.1, 100 + seed))
 
 
 def test_without_a_current_nothing_is_known() -> None:
     bare = replace(signal(0.5, 1), current=None)
     assert resistance(bare) is None
-    assert not heated("left", [signal(0.0, 1)], bare)
+    assert not report_heated_winding("left", [signal(0.0, 1)], bare)
 
 
 def test_segments_and_lost_samples_are_left_out() -> None:

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from smp_motor_ident.bag.names import tells_motors
+from smp_motor_ident.bag.names import separates_motors
 from smp_motor_ident.bag.readers import grid
 from smp_motor_ident.bag.readers.format import Format, Tables
 from smp_motor_ident.bag.storage import TABLE, Channel, Table
@@ -77,11 +77,11 @@ class _CsvFile(Tables):
         """Replace the words of columns that name motors by numbers; return the words."""
         found = {}
         # Single letters may be words of any column
-        for j in [j for j, name in enumerate(self._grid.names) if tells_motors(name, "A")]:
+        for j in [j for j, name in enumerate(self._grid.names) if separates_motors(name, "A")]:
             rows = {k: _row(s, self._separator) for k, s in enumerate(self._lines)}
             body = {k: row for k, row in rows.items() if k >= self._first and j < len(row)}
             words = grid.words([row[j].strip() for row in body.values()])
-            if words and tells_motors(self._grid.names[j], words):
+            if words and separates_motors(self._grid.names[j], words):
                 found[self._grid.names[j]] = words
                 for k, row in body.items():
                     if row[j].strip() in words:

@@ -23,7 +23,7 @@ from smp_motor_ident.tune.limits import MAX_SPEED_NOISE
 from smp_motor_ident.tune.margins import loop_margins
 from smp_motor_ident.tune.methods.simc import SIMC
 from smp_motor_ident.tune.problem import Method, Problem, RequiredMargins
-from smp_motor_ident.tune.unmodelled import words
+from smp_motor_ident.tune.unmodelled import describe_known_band
 
 FOCUS = ("balanced", "tracking", "load")
 MAX_NOISE_RAISES, CONTROL_NOISE_TARGET, SPEED_NOISE_TARGET = 8, 1.2, 1.0
@@ -62,9 +62,10 @@ def _solve(problem: Problem) -> Feedback:
     found = _search(problem, margin, peak, focus)
     found = _match_simc(problem, found, margin, peak, focus)
     if found is None:
+        known = describe_known_band(problem.unmodelled, ", where ")
         raise DesignError(
             f"no controller keeps a phase margin of {margin:g} deg, Ms {peak:g} and a control "
-            f"noise of {problem.loop.noise_limit:.3g} V{words(problem.unmodelled, ', where ')}; "
+            f"noise of {problem.loop.noise_limit:.3g} V{known}; "
             f"{_describe_nearest(problem, margin, peak, focus)}"
         )
     return found[0]
@@ -246,7 +247,7 @@ def _at_bandwidth(problem: Problem, wished: float, margin: float, peak: float) -
         f"bandwidth {wished:.4g} rad/s cannot keep a phase margin of {margin:g} deg, Ms {peak:g} "
         f"and a control noise of {problem.loop.noise_limit:.3g} V with {delay:.3g} ms of delay at "
         f"{problem.loop.rate:.4g} Hz (Nyquist {nyquist:.4g} rad/s)"
-        f"{words(problem.unmodelled, ', where ')}; {hint} rad/s"
+        f"{describe_known_band(problem.unmodelled, ', where ')}; {hint} rad/s"
     )
 
 

@@ -13,7 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from smp_motor_ident.bag import read_records
-from smp_motor_ident.bag.counter import Wrap, counts_of, is_full, unwrap, unwrap_angle
+from smp_motor_ident.bag.counter import Wrap, is_full, round_to_counts, unwrap, unwrap_angle
 from smp_motor_ident.errors import BagError
 
 
@@ -384,9 +384,9 @@ def test_counts_that_no_encoder_makes_are_refused(tmp_path: Path) -> None:
 
 
 def test_the_roundest_width_is_found_at_once_however_many_are_admitted() -> None:
-    assert counts_of(Wrap(3.1e17, 1e16, 5), 10**9) == 2**58
-    assert counts_of(Wrap(2.0e17 - 100, 1e14, 5), 10**9) % 1000 == 0
-    assert counts_of(Wrap(1999.8, 0.1, 5), 1990) == 2000
+    assert round_to_counts(Wrap(3.1e17, 1e16, 5), 10**9) == 2**58
+    assert round_to_counts(Wrap(2.0e17 - 100, 1e14, 5), 10**9) % 1000 == 0
+    assert round_to_counts(Wrap(1999.8, 0.1, 5), 1990) == 2000
 
 
 def folded(top: float, lag: float, drive: str) -> np.ndarray:

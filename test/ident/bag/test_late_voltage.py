@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from smp_motor_ident.bag import read_records
-from smp_motor_ident.bag.drives import rows_behind
+from smp_motor_ident.bag.drives import find_late_rows
 
 N = 2000
 RNG = np.random.default_rng(17)
@@ -43,8 +43,8 @@ def test_the_rows_that_a_command_is_late_are_found(drive: str, rows: int) -> Non
     if drive == "square" and rows > 10:
         pytest.skip("of a square wave most of a half period late is as well the rest of it ahead")
     speed = noisy(turned(DRIVES[drive]))
-    assert rows_behind(DRIVES[drive][rows:], speed[: N - rows]) == 0  # it leads
-    assert rows_behind(np.roll(DRIVES[drive], rows)[rows:], speed[rows:]) == rows
+    assert find_late_rows(DRIVES[drive][rows:], speed[: N - rows]) == 0  # it leads
+    assert find_late_rows(np.roll(DRIVES[drive], rows)[rows:], speed[rows:]) == rows
 
 
 @pytest.mark.parametrize("drive", [*DRIVES, "sine"])
@@ -52,7 +52,7 @@ def test_the_rows_that_a_command_is_late_are_found(drive: str, rows: int) -> Non
 @pytest.mark.parametrize("lag", [2.0, 50.0])
 def test_a_punctual_command_is_not_moved(drive: str, lag: float, winding: float) -> None:
     voltage = DRIVES.get(drive, 6 * np.sin(np.arange(N) * 2 * np.pi / 150))
-    assert rows_behind(voltage, noisy(turned(voltage, lag, winding))) == 0
+    assert find_late_rows(voltage, noisy(turned(voltage, lag, winding))) == 0
 
 
 def test_noise_fed_back_by_a_loop_does_not_move_the_command() -> None:
@@ -63,14 +63,14 @@ def test_noise_fed_back_by_a_loop_does_not_move_the_command() -> None:
         rows.append((voltage, measured))
         speed += 0.1 * (25 * voltage - speed)
     voltage, measured = np.array(rows).T
-    assert rows_behind(voltage, measured) == 0
+    assert find_late_rows(voltage, measured) == 0
 
 
 def test_it_is_told_in_milliseconds() -> None:
     voltage = RNG.normal(size=20_000)
-    rows_behind(voltage[:500], voltage[:500])  # compiles
+    find_late_rows(voltage[:500], voltage[:500])  # compiles
     begin = time.perf_counter()
-    rows_behind(voltage, np.cumsum(voltage))
+    find_late_rows(voltage, np.cumsum(voltage))
     assert time.perf_counter() - begin < 5.0  # on a busy machine
 
 

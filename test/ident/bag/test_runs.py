@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from smp_motor_ident.bag import list_topics, read_records
-from smp_motor_ident.bag.clock import runs
+from smp_motor_ident.bag.clock import split_into_runs
 from smp_motor_ident.errors import BagError
 from smp_motor_ident.record import Record
 
@@ -183,18 +183,18 @@ def test_rows_of_two_kinds_that_were_written_in_turn_are_no_runs() -> None:
     )
     first = np.where(np.arange(200) // 50 % 2 == 0, 1.0, np.nan)
     second = np.where(np.isnan(first), 2.0, np.nan)
-    assert runs(time, {"u": first, "w": second}) == [(0, 200)]
+    assert split_into_runs(time, {"u": first, "w": second}) == [(0, 200)]
 
 
 def test_late_blocks_and_rows_do_not_hide_a_clock_that_starts_again() -> None:
     """Each late block is held against what came since the last, so that many cost little."""
     blocks = np.arange(20_000.0).reshape(-1, 20)
     late = blocks.reshape(-1, 2, 20)[:, ::-1].ravel()
-    assert runs(late, {}) == [(0, late.size)]
+    assert split_into_runs(late, {}) == [(0, late.size)]
     stray = np.arange(20_000.0)
     stray[1000::1000] -= 50
     twice = np.concatenate([late, stray, stray])
-    assert runs(twice, {}) == [(0, 20_000), (20_000, 40_000), (40_000, 60_000)]
+    assert split_into_runs(twice, {}) == [(0, 20_000), (20_000, 40_000), (40_000, 60_000)]
 
 
 def test_two_tables_of_one_clock_start_again_together(tmp_path: Path) -> None:

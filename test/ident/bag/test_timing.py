@@ -14,7 +14,7 @@ from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 
 from smp_motor_ident.bag import BagWriter, join_records, read_records
-from smp_motor_ident.bag.clock import fit_clock, mean_held
+from smp_motor_ident.bag.clock import average_held_input, fit_clock
 from smp_motor_ident.errors import BagError
 
 # Without shrinking, which takes minutes where an example is a whole bag.
@@ -261,7 +261,7 @@ def test_a_held_input_is_averaged_over_each_interval(data: st.DataObject, held: 
     at = at[at >= time[0]]
     if at.size < 2:
         return
-    found = mean_held(time, value, held, at)
+    found = average_held_input(time, value, held, at)
     # By brute force, millisecond by millisecond.
     grid = np.arange(1_000_000, 1_001_000_000, 1_000_000)  # ends of the milliseconds
     if held == "after":

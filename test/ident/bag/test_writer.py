@@ -14,7 +14,7 @@ from mcap.reader import make_reader
 from rosbags.highlevel import AnyReader
 
 from smp_motor_ident.bag import BagWriter, read_records
-from smp_motor_ident.bag.replay import Replay, offered
+from smp_motor_ident.bag.replay import Replay, find_offered_qos
 from smp_motor_ident.errors import BagError
 
 FLOAT = "std_msgs/msg/Float64"
@@ -165,7 +165,7 @@ def test_recorded_qos_of_every_version_is_understood(
 ) -> None:
     from smp_motor_ident.bag.storage import Channel
 
-    assert offered(Channel(1, "/a", FLOAT, qos=qos)) == expected
+    assert find_offered_qos(Channel(1, "/a", FLOAT, qos=qos)) == expected
 
 
 @pytest.mark.parametrize("storage", ["mcap", "db3"])
