@@ -49,19 +49,17 @@ PARAMETER_SERVICES = ("rcl_interfaces/", "type_description_interfaces/")
 
 HEAD = """# Nodes
 
-Topics, services and parameters of every node, as declared in its code; printed by
-`python scripts/nodes.py`. Names are relative to the robot's namespace (`-r __ns:=/robot1`), those
-with a slash before them are common to all robots; `wheel_pid` runs in its wheel's
-(`-r __ns:=/robot1/front_left`). Units are SI. All nodes answer the usual parameter services and
-write to `/rosout`. `skid_steer` also reads `cmd_vel` as `geometry_msgs/msg/Twist` once that is
-published, and publishes `/tf` where `tf2_msgs` is installed. `record` and `play` have the topics
-named by their arguments (`--help`).
+Topics, services and parameters of every node, printed from the code by `python scripts/nodes.py`.
+Units are SI. Names are relative to the robot's namespace (`-r __ns:=/robot1`), and `wheel_pid` runs
+in that of its wheel (`-r __ns:=/robot1/front_left`). All robots share names with a leading slash.
+All nodes answer the usual parameter services and write to `/rosout`. `skid_steer` also reads
+`cmd_vel` as `geometry_msgs/msg/Twist` if that is published, and publishes `/tf` if `tf2_msgs` is
+installed. The arguments of `record` and `play` name their topics (`--help`).
 
-All nodes have `use_sim_time`: stamps, ages and the intervals of odometry and control then follow
-`/clock`, and a missing `/clock` is reported on `/diagnostics`. Time-outs run in real time, so a
-stopped clock stops no watchdog: a clock so slow that feedback exceeds `feedback_timeout` stops the
-wheels. The motors of `motor_plant` also move in simulated time; the signals of `excite` run in
-real time.
+With `use_sim_time`, stamps, ages and the intervals of odometry and control follow `/clock`, as do
+the motors of `motor_plant`; a missing `/clock` is reported on `/diagnostics`. Time-outs and the
+signals of `excite` run in real time. A stopped clock therefore disables no watchdog, and a clock so
+slow that feedback exceeds `feedback_timeout` stops the wheels.
 """
 
 
