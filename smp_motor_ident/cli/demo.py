@@ -14,21 +14,11 @@ def parser() -> Parser:
         "Start a simulated robot as real processes, excite and record its wheels, identify and "
         "tune them, drive it, and compare the results with the true motors. It ends by itself."
     ))  # fmt: skip
-    made.add_argument(
-        "--output",
-        "-o",
-        default="demo_output",
-        metavar="DIR",
-        help="folder for the results; default demo_output",
-    )
+    made.add_argument("--output", "-o", default="demo_output", metavar="DIR",
+        help="folder for the results; default demo_output")  # fmt: skip
     made.add_argument("--motors", metavar="FILE", help="the true motors; default: the paper's")
-    made.add_argument(
-        "--rate",
-        type=number(0),
-        default=200.0,
-        metavar="HZ",
-        help="samples per second; default 200",
-    )
+    made.add_argument("--rate", type=number(0), default=200.0, metavar="HZ",
+        help="samples per second; default 200")  # fmt: skip
     made.add_argument("--domain", type=int, help="ROS domain; default: a free one")
     return made
 

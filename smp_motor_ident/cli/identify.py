@@ -58,35 +58,22 @@ def parser() -> Parser:
     add("--map", action="extend", nargs="+", default=[], metavar="KEY=VALUE",
         help="which column or topic is which signal; see below")  # fmt: skip
     add("--mapping", metavar="FILE", help="the same in a YAML file")
-    add(
-        "--msg",
-        action="append",
-        default=[],
-        metavar="FILE",
-        help=".msg file of an unknown message type",
-    )
+    add("--msg", action="append", default=[], metavar="FILE",
+        help=".msg file of an unknown message type")  # fmt: skip
     add(
         "--controller", nargs="+", metavar=("FORMAT", "GAIN=VALUE"),
         help="reconstruct the voltage from set-points (--map setpoint=...) of a known controller: "
         "linorobot2, ros_arduino_bridge, arduino_pid, ros2_controllers or wpilib",
     )  # fmt: skip
     add("--topics", action="store_true", help="list the signals and propose a mapping")
-    add(
-        "--fleet",
-        action="store_true",
-        help="identify each recording by itself and compare them in one table",
-    )
+    add("--fleet", action="store_true",
+        help="identify each recording by itself and compare them in one table")  # fmt: skip
     add("--scheduler", metavar="ADDRESS", help="with --fleet: address of a Dask scheduler")
     add("--history", metavar="FILE", help="draw a history of the node identifier in the report")
     add("--tuning", action="store_true", help="add the tuning page to the report (takes longer)")
     add("--what-next", action="store_true", help="propose the next recording")
-    add(
-        "--accuracy",
-        type=number(0, 1),
-        default=0.01,
-        metavar="SHARE",
-        help="relative accuracy that --what-next plans for; default 0.01",
-    )
+    add("--accuracy", type=number(0, 1), default=0.01, metavar="SHARE",
+        help="relative accuracy that --what-next plans for; default 0.01")  # fmt: skip
     add("--verbose", "-v", action="store_true", help="print all findings")
     add("--quiet", "-q", action="store_true", help="print errors only")
     return made

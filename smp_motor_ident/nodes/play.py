@@ -170,46 +170,18 @@ def parser() -> argparse.ArgumentParser:
     add = made.add_argument
     add("bag", metavar="BAG", help="folder of the bag, or a bare .mcap or .db3 file")
     add("--topics", nargs="+", default=[], metavar="TOPIC", help="play only these topics")
-    add(
-        "--regex",
-        "-e",
-        default="",
-        metavar="PATTERN",
-        help="play only topics whose whole name matches",
-    )
+    add("--regex", "-e", default="", metavar="PATTERN",
+        help="play only topics whose whole name matches")  # fmt: skip
     add("--exclude", "-x", default="", metavar="PATTERN", help="leave out topics that match")
-    add(
-        "--rate",
-        "-r",
-        type=float,
-        default=1.0,
-        metavar="R",
-        help="speed of playback: 2 is twice as fast; default 1",
-    )
-    add(
-        "--start-offset",
-        type=float,
-        default=0.0,
-        metavar="S",
-        help="start this long after the beginning of the bag",
-    )
+    add("--rate", "-r", type=float, default=1.0, metavar="R",
+        help="speed of playback: 2 is twice as fast; default 1")  # fmt: skip
+    add("--start-offset", type=float, default=0.0, metavar="S",
+        help="start this long after the beginning of the bag")  # fmt: skip
     add("--loop", "-l", action="store_true", help="start again at the end")
-    add(
-        "--clock",
-        nargs="?",
-        type=float,
-        const=40.0,
-        default=0.0,
-        metavar="HZ",
-        help="publish /clock, 40 times a second by default",
-    )
-    add(
-        "--delay",
-        type=float,
-        default=DISCOVERY_TIME_S,
-        metavar="S",
-        help="wait before the first message",
-    )
+    add("--clock", nargs="?", type=float, const=40.0, default=0.0, metavar="HZ",
+        help="publish /clock, 40 times a second by default")  # fmt: skip
+    add("--delay", type=float, default=DISCOVERY_TIME_S, metavar="S",
+        help="wait before the first message")  # fmt: skip
     return made
 
 

@@ -195,23 +195,12 @@ def parser() -> argparse.ArgumentParser:
     add("topics", nargs="*", metavar="TOPIC", help="topics to record (default: all)")
     add("--output", "-o", metavar="DIR", help="folder of the bag (default: rosbag2_DATE)")
     add("--all", "-a", action="store_true", help="record all topics (the default)")
-    add(
-        "--regex",
-        "-e",
-        default="",
-        metavar="PATTERN",
-        help="record topics whose whole name matches",
-    )
+    add("--regex", "-e", default="", metavar="PATTERN",
+        help="record topics whose whole name matches")  # fmt: skip
     add("--exclude", "-x", default="", metavar="PATTERN", help="leave out topics that match")
     add("--include-hidden", action="store_true", help="record topics with a leading underscore too")
-    add(
-        "--duration",
-        "-d",
-        type=float,
-        default=0.0,
-        metavar="S",
-        help="end after this time; default: at Ctrl-C",
-    )
+    add("--duration", "-d", type=float, default=0.0, metavar="S",
+        help="end after this time; default: at Ctrl-C")  # fmt: skip
     add("--force", action="store_true", help="replace an existing bag")
     return made
 
