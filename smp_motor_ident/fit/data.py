@@ -71,7 +71,7 @@ class Data:
 
     @cached_property
     def bounds(self) -> Integers:
-        """First and end of every segment among the measured values, shape (segments, outputs, 2)."""
+        """First and end of segments among the values, shape (segments, outputs, 2)."""
         ends, offset = [], 0
         for known in self.known:
             ends.append(offset + np.searchsorted(known, self.rows.segment))

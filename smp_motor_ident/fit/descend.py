@@ -104,7 +104,7 @@ def linearise(
     """Return whitened residuals and derivatives of a chain."""
     free = chain.free
     p = len(free)
-    # The base, a lane for each parameter, then for q and w of the segments unless all begin at rest.
+    # The base, each parameter, then q and w of the segments unless all begin at rest.
     states = 0 if data.stood.all() else 2
     count = p + 1 + states
     values = {q.name: np.full(count, chain.values[q.name]) for q in chain.parameters}
@@ -163,7 +163,7 @@ def residual(data: Data, chain: Chain, like: Fit) -> Array | None:
         known = data.known[k]
         rest = (measured[known] - predicted[0, known])[None]
         parts.append(like.noise[k].whiten(rest, _runs(data, k, like.noise[k]))[0])
-    r = np.concatenate(parts)
+    r: Array = np.concatenate(parts)
     if not np.isfinite(r).all():
         return None
     if np.isfinite(data.huber):
@@ -182,7 +182,7 @@ def residual(data: Data, chain: Chain, like: Fit) -> Array | None:
 
 def _weight(residual: Array, huber: float) -> Array:
     """Return the square root of the weights of a robust loss."""
-    return np.sqrt(np.minimum(1.0, huber / np.maximum(np.abs(residual), 1e-300)))
+    return np.asarray(np.sqrt(np.minimum(1.0, huber / np.maximum(np.abs(residual), 1e-300))))
 
 
 def _state_prior(scales: Scales) -> Array:

@@ -54,4 +54,5 @@ def terminal_voltage(
         drive /= 1.0 + lane[SAG] * duty * duty
     drop, most = lane[DROP], lane[CURRENT_LIMIT]
     drive -= min(max(drive, -drop), drop)
-    return emf + min(max(drive, -most), most)
+    out = emf + min(max(drive, -most), most)
+    return out

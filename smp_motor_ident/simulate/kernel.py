@@ -33,6 +33,7 @@ from smp_motor_ident.simulate.lanes import (
 )
 
 ENTRIES = 12  # of a transition: of q, w and th at its end by q, w, voltage and force
+UNITS = ((1.0, 0.0, 0.0, 0.0), (0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0), (0.0, 0.0, 0.0, 1.0))
 EVENTS = 60  # of friction within one piece, at most
 STUCK = 0.0
 
@@ -83,12 +84,9 @@ def transitions(lengths: Array, lanes: Array) -> Array:
         te, tm, k, be = lanes[TE, b], lanes[TM, b], lanes[K, b], lanes[BE, b]
         for n in range(lengths.shape[0]):
             h = lengths[n, b]
-            at = 0
-            for q, w, v, f in ((1.0, 0.0, 0.0, 0.0), (0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0),
-                               (0.0, 0.0, 0.0, 1.0)):  # fmt: skip
+            for at, (q, w, v, f) in enumerate(UNITS):
                 q1, w1, th = _flow(q, w, h, v, f, te, tm, k, be)
                 out[b, n, at], out[b, n, at + 4], out[b, n, at + 8] = q1, w1, th
-                at += 1
     return out
 
 
@@ -288,8 +286,7 @@ def run(  # noqa: C901 - one pass, kept whole so that nothing is stored between 
                     # A dip through zero needs a speed that the first slope uses up.
                     if friction and (
                         w1 * direction <= 0.0
-                        or te > 0.0
-                        and (tm * w + h * (q - be * w - f)) * direction <= 0.0
+                        or (te > 0.0 and (tm * w + h * (q - be * w - f)) * direction <= 0.0)
                     ):
                         q, w, th, direction = _advance(
                             q, w, th, direction, h, v, force, plus, minus, hold, te, tm, k, be
@@ -313,4 +310,5 @@ def _after(
 ) -> float:
     """Return one output of a tabulated transition."""
     moved: float = tables[b, kind, at] * q + tables[b, kind, at + 1] * w
-    return moved + (tables[b, kind, at + 2] * v + tables[b, kind, at + 3] * f)
+    moved += tables[b, kind, at + 2] * v + tables[b, kind, at + 3] * f
+    return moved

@@ -91,7 +91,7 @@ def simulate(
         rows.segment, initial, added, friction, feedback, full_duty, age, out, volts,
     )  # fmt: skip
     drive, speed, angle = out
-    gathered = volts
+    gathered: Array = volts
     if charge:
         first = np.repeat(rows.segment[:-1], np.diff(rows.segment))
         put = np.cumsum(volts * rows.interval, axis=1)
