@@ -90,7 +90,7 @@ def estimate(
             if not request.may_leave_current:
                 raise
             bare, other = request.without_current(group)
-            return _estimated(bare, other, [*screen(bare), _left_out(refusal)])
+            return _estimated(bare, other, [*screen(bare), _report_left_out(refusal)])
 
 
 def _estimated(group: list[Record], request: Request, found: Sequence[Finding]) -> Estimate:
@@ -137,7 +137,7 @@ def _best_fit(data: Data, request: Request) -> Fit:
     return constrain(data, found, request.constraints) if request.constraints else found
 
 
-def _left_out(refusal: SmpError) -> Finding:
+def _report_left_out(refusal: SmpError) -> Finding:
     return Finding(
         "current_left_out",
         "warning",

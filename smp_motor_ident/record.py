@@ -135,7 +135,9 @@ class Record:
             object.__setattr__(self, name, values)
         if not np.all(np.isfinite(self.voltage)):
             k = int(np.argmin(np.isfinite(self.voltage)))
-            raise SignalError(f"{where}: voltage is {self.voltage[k]} at t = {time[k]} s")
+            raise SignalError(
+                f"{where}: voltage is {self.voltage[k]} at t = {time[k]} s; it must be finite"
+            )
         if self.count is not None:
             count = np.ascontiguousarray(self.count, dtype=np.int64)
             if count.shape != time.shape:

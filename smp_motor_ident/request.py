@@ -138,9 +138,11 @@ def _check_bounds(
 ) -> None:
     for name, limits in bounds.items():
         if name not in PHYSICAL:
-            raise ParameterError(f"bounds of {name!r}: not one of {', '.join(PHYSICAL)}")
+            raise ParameterError(f"bounds of {name!r}; the name must be of {', '.join(PHYSICAL)}")
         if len(limits) != 2 or not limits[0] <= limits[1]:
-            raise ParameterError(f"bounds of {name} = {limits}: two numbers, the lower one first")
+            raise ParameterError(
+                f"bounds of {name} = {limits}; it must be two numbers, the lower one first"
+            )
         if model not in ("auto", "electromechanical") or not has_current(group):
             raise ParameterError(
                 f"bounds of {name}: voltage and speed alone do not determine it; record the "

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A link of the chain that produces a recording: its parameters, its effect, where fits begin."""
+"""A link of the chain that produces a recording: parameters, effect, starting values."""
 
 from __future__ import annotations
 

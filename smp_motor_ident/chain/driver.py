@@ -19,7 +19,7 @@ def _sizes(name: str, *sizes: float) -> list[dict[str, float]]:
 
 
 class DeadZone(Component):
-    """A command that the driver swallows up to a size [V]."""
+    """A driver that subtracts a voltage from the size of a command [V]."""
 
     code, slot, title = "dead_zone", "dead_zone", "dead zone of the driver"
     severity = "warning"
@@ -85,7 +85,7 @@ class WeakSide(Component):
 
     code, slot, title = "weak_side", "weak_side", "driver weaker in reverse"
     severity = "warning"
-    advice = "record the voltage at the terminals, which tells a driver from a motor"
+    advice = "record the voltage at the terminals, which separates driver and motor"
     rank = 1
     linear = "weak_side"
     parameters = (Parameter("weak_side", "1", -0.5, 0.5, typical=0.02),)
@@ -147,11 +147,11 @@ class Sag(Component):
 
 
 class Drop(Component):
-    """A voltage drop over brushes or transistors, whatever the current [V]."""
+    """A constant voltage drop over brushes or transistors [V]."""
 
     code, slot, title = "brush_drop", "drop", "voltage drop over brushes or transistors"
     severity = "note"
-    advice = "record the voltage at the terminals to take the driver out of the number"
+    advice = "record the voltage at the terminals so that the estimates exclude the driver"
     linear = "brush_drop"
     parameters = (Parameter("brush_drop", "V", 0.0, 0.4, typical=0.03),)
 

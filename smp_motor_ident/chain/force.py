@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Friction and loads besides Coulomb friction."""
+"""Friction and loads other than Coulomb friction."""
 
 from __future__ import annotations
 
@@ -94,7 +94,7 @@ class LoadStep(Component):
 
     code, slot, title = "load_step", "load_step", "load that begins during the recording"
     severity = "warning"
-    advice = "look for an obstacle of the motor"
+    advice = "look for what brakes the motor from then on"
     linear = "load_step"
     alters = True
     parameters = (

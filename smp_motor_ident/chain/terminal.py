@@ -34,7 +34,7 @@ class Driver:
 
     @property
     def threshold(self) -> float:
-        """Command [V] that it swallows before anything moves."""
+        """Largest command [V] without output."""
         return float(self.numbers[DEAD_ZONE] + self.lane[at.DROP])
 
     @property

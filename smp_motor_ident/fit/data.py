@@ -169,7 +169,7 @@ def prepare(records: Sequence[Record], use_current: bool, huber: float = np.inf)
         else:
             assert record.velocity is not None
             motion, quantum = record.velocity, speed_quantum(record.velocity)
-        motions.append(motion if quantum else dithered(motion, is_angle, rng))
+        motions.append(motion if quantum else dither(motion, is_angle, rng))
     lengths = np.cumsum([0, *(len(r) for r in records)])
     starts = [n + s for n, r in zip(lengths, records) for s in r.starts]
     segment = np.array([*starts, lengths[-1]], dtype=np.int64)
@@ -182,7 +182,7 @@ def prepare(records: Sequence[Record], use_current: bool, huber: float = np.inf)
     current = None
     if use_current:
         every = [np.full(len(r), np.nan) if r.current is None else r.current for r in records]
-        current = np.concatenate([dithered(i, False, rng) for i in every])
+        current = np.concatenate([dither(i, False, rng) for i in every])
     initial = _initial(time, motion, segment, is_angle)
     initial[stood, 1] = 0.0
     supply = max(r.hardware.supply_voltage or 0.0 for r in records)
@@ -208,7 +208,7 @@ def _initial(time: Array, motion: Array, segment: Integers, is_angle: bool) -> A
     return initial
 
 
-def dithered(values: Array, is_angle: bool, rng: np.random.Generator) -> Array:
+def dither(values: Array, is_angle: bool, rng: np.random.Generator) -> Array:
     """Return a signal as the finest sensor of it reads.
 
     A simulator's noise-free signal would otherwise have unbounded weight relative to the others.

@@ -282,19 +282,19 @@ def descend(
     damping = 1e-4
     for _ in range(most):
         if not at.free:
-            start = _settled(start, linear, np.zeros(0))
+            start = _settle_states(start, linear, np.zeros(0))
             linear = linearise(data, at, scales, start, noise)
             break
         step = _step(linear, at, scales, damping)
         if not np.isfinite(step).all():
             break
-        values = _moved(at, scales, step)
+        values = _apply_step(at, scales, step)
         taken = np.array([values[p.name] - at.values[p.name] for p in at.free])
         expected = float(taken @ (2 * linear.columns.T @ linear.residual - linear.normal @ taken))
         if 0 <= expected < 0.1 * min(CONVERGED, converged):
             break
         trial = at.with_values(values)
-        trial_start = _settled(start, linear, taken)
+        trial_start = _settle_states(start, linear, taken)
         following = linearise(data, trial, scales, trial_start, noise)
         gained = linear.cost - following.cost
         least = converged * min(linear.cost / linear.row.size, 1.0)
@@ -345,7 +345,7 @@ def _step(linear: Linear, chain: Chain, scales: Scales, damping: float) -> Array
     return step * (FARTHEST / longest) if longest > FARTHEST else step
 
 
-def _moved(chain: Chain, scales: Scales, step: Array) -> dict[str, float]:
+def _apply_step(chain: Chain, scales: Scales, step: Array) -> dict[str, float]:
     """Return values after a step, within their bounds."""
     out = {}
     for s, p in zip(step, chain.free, strict=True):
@@ -354,7 +354,7 @@ def _moved(chain: Chain, scales: Scales, step: Array) -> dict[str, float]:
     return out
 
 
-def _settled(initial: Array, linear: Linear, step: Array) -> Array:
+def _settle_states(initial: Array, linear: Linear, step: Array) -> Array:
     out = initial.copy()
     out[:, :3] += linear.local_step - linear.local_gain @ step
     return out
@@ -372,11 +372,11 @@ def fit(
             noise[0] = Noise.integrated(float(np.nanstd(data.speed)) * data.rows.step or 1.0)
         found = descend(data, chain, scales, initial, noise, most=20, converged=1.0)
         chain, initial = found.chain, found.initial
-        noise = noises(data, found.linear, most)
+        noise = fit_noises(data, found.linear, most)
     found = descend(data, chain, scales, initial, noise, most=8, converged=1.0)
     least = max(10 * converged, 1.0)
     for _ in range(rounds):
-        noise = noises(data, found.linear, most)
+        noise = fit_noises(data, found.linear, most)
         if _likelier_by(data, found, noise) < least:
             break
         other = descend(data, found.chain, scales, found.initial, noise, converged=converged)
@@ -410,7 +410,7 @@ def refine(data: Data, found: Fit) -> Fit:
         return found
     white = (Noise.white(float(np.nanstd(data.motion - found.motion))), *found.noise[1:])
     begun = descend(data, found.chain, found.scales, found.initial, white)
-    other = fit(data, begun.chain, begun.scales, begun.initial, noises(data, begun.linear))
+    other = fit(data, begun.chain, begun.scales, begun.initial, fit_noises(data, begun.linear))
     return min(found, other, key=lambda f: _information_criterion(data, f))
 
 
@@ -433,23 +433,23 @@ def constrain(data: Data, found: Fit, constraints: Sequence[Constraint]) -> Fit:
 
 def refit(data: Data, found: Fit) -> Fit:
     """Return the fit to other rows of the recording of a fit, under the noise that they show."""
-    begun, noise = _begun(data, found)
+    begun, noise = _restart(data, found)
     return fit(data, found.chain, found.scales, begun.initial, noise)
 
 
 def restate(data: Data, found: Fit) -> Fit:
     """Return a fit at the same values on other rows of its recording."""
-    begun, noise = _begun(data, found)
+    begun, noise = _restart(data, found)
     linear = linearise(data, found.chain, found.scales, begun.initial, noise)
     return replace(found, initial=begun.initial, noise=tuple(noise), linear=linear)
 
 
-def _begun(data: Data, found: Fit) -> tuple[Fit, list[Noise]]:
+def _restart(data: Data, found: Fit) -> tuple[Fit, list[Noise]]:
     """Return the initial states, and the noise, of other rows of the recording of a fit."""
     still = replace(found.chain, fixed=frozenset(p.name for p in found.chain.parameters))
     white = [Noise.white(float(np.nanstd(y)) or 1.0) for y in data.outputs]
     begun = descend(data, still, found.scales, data.initial, white)
-    return begun, noises(data, begun.linear)
+    return begun, fit_noises(data, begun.linear)
 
 
 def settle(data: Data, chain: Chain, scales: Scales) -> Array:
@@ -461,11 +461,11 @@ def settle(data: Data, chain: Chain, scales: Scales) -> Array:
     initial = data.initial
     for _ in range(4):
         linear = linearise(motion, fixed, scales, initial, noise)
-        initial = _settled(initial, linear, np.zeros(0))
+        initial = _settle_states(initial, linear, np.zeros(0))
     return linearise(motion, fixed, scales, initial, noise).simulated[0]
 
 
-def noises(data: Data, linear: Linear, most: int = MAX_ORDER) -> list[Noise]:
+def fit_noises(data: Data, linear: Linear, most: int = MAX_ORDER) -> list[Noise]:
     """Return the noise of every output by its residual."""
     every = zip(data.outputs, linear.simulated, data.known, data.runs, strict=True)
     return [fit_noise((y - x)[known], runs, most) for y, x, known, runs in every]

@@ -29,7 +29,7 @@ from smp_motor_ident.chain.sensor import Angle, DifferencedSpeed, Speed
 from smp_motor_ident.errors import CurrentError, InsufficientExcitationError
 from smp_motor_ident.fit.adequacy import scatters
 from smp_motor_ident.fit.data import Data
-from smp_motor_ident.fit.descend import Fit, Linear, descend, fit, noises, residual
+from smp_motor_ident.fit.descend import Fit, Linear, descend, fit, fit_noises, residual
 from smp_motor_ident.fit.start import guesses
 
 SEARCH_ORDER = 2
@@ -86,10 +86,10 @@ class Candidate:
 def search(data: Data, policy: SelectionPolicy | None = None, say: Say = lambda _: None) -> Fit:
     """Return the fit of the chain that explains the data at the lowest price."""
     policy = policy or SelectionPolicy()
-    found = _improved(_begin(data, policy), data, policy, say)
+    found = _improve(_fit_simplest(data, policy), data, policy, say)
     if policy.restarts and inadequacy(data, found) > policy.inadequate:
         for begun in _restarts(found, data, policy, say):
-            other = _improved(begun, data, policy, say)
+            other = _improve(begun, data, policy, say)
             if other.deviance < found.deviance - 20.0:
                 found = other
     return found
@@ -107,7 +107,7 @@ def inadequacy(data: Data, found: Fit) -> float:
     return max((one.ratio for one in scatters(data, found)), default=1.0)
 
 
-def _improved(found: Fit, data: Data, policy: SelectionPolicy, say: Say) -> Fit:
+def _improve(found: Fit, data: Data, policy: SelectionPolicy, say: Say) -> Fit:
     """Return the fit of a chain with components added, exchanged and dropped."""
     exchanged = False
     for _ in range(policy.rounds):
@@ -119,7 +119,7 @@ def _improved(found: Fit, data: Data, policy: SelectionPolicy, say: Say) -> Fit:
         if better is None:
             break
         found = better
-    return _without_needless(found, data, policy)
+    return _drop_needless(found, data, policy)
 
 
 def _restarts(found: Fit, data: Data, policy: SelectionPolicy, say: Say) -> list[Fit]:
@@ -133,7 +133,7 @@ def _restarts(found: Fit, data: Data, policy: SelectionPolicy, say: Say) -> list
         if not one.alters or found.chain.has(one.code):
             continue
         say(f"beginning again with {one.title}")
-        fits += _begun(motion, guesses(motion, 1, one), policy)
+        fits += _fit_starts(motion, guesses(motion, 1, one), policy)
     fits.sort(key=lambda f: f.deviance)
     best = fits[:1]
     return best if data.current is None else [_with_current(data, f) for f in best]
@@ -172,7 +172,7 @@ def screen(found: Fit, data: Data, policy: SelectionPolicy) -> list[Candidate]:
         price = policy.price(one, _information(one, chain, found, energy))
         gain = gain_of(data, found.linear, rest)
         share = -float(signature @ base) / energy if energy > 0 else 0.0
-        scaled = _scaled(one, chain, found, share)
+        scaled = _rescale(one, chain, found, share)
         if scaled is not None:
             along = gain_of(data, found.linear, base + share * signature)
             if along > gain:
@@ -198,7 +198,7 @@ def typical_size(one: Component, chain: Chain, found: Fit) -> float:
     return new.typical * unit / size if size > 0 else 1.0
 
 
-def _scaled(one: Component, chain: Chain, found: Fit, share: float) -> Chain | None:
+def _rescale(one: Component, chain: Chain, found: Fit, share: float) -> Chain | None:
     """Return the chain with a component of another size, where its effect is proportional to it."""
     p = next((p for p in one.parameters if p.name == one.linear), None)
     if p is None or not abs(share) < 4.0:
@@ -228,16 +228,16 @@ def gain_of(data: Data, before: Linear, after: Array) -> float:
     return total
 
 
-def _begin(data: Data, policy: SelectionPolicy) -> Fit:
+def _fit_simplest(data: Data, policy: SelectionPolicy) -> Fit:
     """Return the best fit of the plainest motors from the best guesses."""
     motion = replace(data, current=None)
-    fits = _begun(motion, guesses(motion, 3), policy)
+    fits = _fit_starts(motion, guesses(motion, 3), policy)
     if not fits:
         raise InsufficientExcitationError("no motor follows the voltage")
     return fits[0] if data.current is None else _with_current(data, fits[0])
 
 
-def _begun(data: Data, chains: Sequence[Chain], policy: SelectionPolicy) -> list[Fit]:
+def _fit_starts(data: Data, chains: Sequence[Chain], policy: SelectionPolicy) -> list[Fit]:
     """Return the fit that begins at the best of some guesses, if there are any."""
     firsts = []
     for chain in chains:
@@ -315,20 +315,20 @@ def _with_current(data: Data, found: Fit) -> Fit:
     )
 
 
-def quick(data: Data, chain: Chain, like: Fit) -> Fit:
+def fit_roughly(data: Data, chain: Chain, like: Fit) -> Fit:
     """Return a fit that is good enough to be compared, under the noise of another."""
     return descend(data, chain, like.scales, like.initial, like.noise, most=10, converged=ROUGH)
 
 
-def _renewed(data: Data, found: Fit) -> Fit:
+def _refit_noise(data: Data, found: Fit) -> Fit:
     """Return the fit under the noise of its own residual."""
-    noise = noises(data, found.linear, SEARCH_ORDER)
+    noise = fit_noises(data, found.linear, SEARCH_ORDER)
     return descend(data, found.chain, found.scales, found.initial, noise, most=8, converged=ROUGH)
 
 
 def _best_addition(found: Fit, data: Data, policy: SelectionPolicy, say: Say) -> Fit | None:
     best = _fitted(found, data, screen(found, data, policy), policy, say)
-    return None if best is None or best[0] <= 0 else _renewed(data, best[1])
+    return None if best is None or best[0] <= 0 else _refit_noise(data, best[1])
 
 
 def _fitted(
@@ -346,7 +346,7 @@ def _fitted(
         if best is not None and candidate.gain < CLEARLY * best[0]:
             continue  # the next round screens it again
         say(f"fitting {candidate.component.title}")
-        one = quick(data, candidate.chain, found)
+        one = fit_roughly(data, candidate.chain, found)
         net = gain_of(data, found.linear, one.linear.residual) - candidate.price
         if best is None or net > best[0]:
             best = net, one
@@ -385,7 +385,7 @@ def _best_exchange(found: Fit, data: Data, policy: SelectionPolicy, say: Say) ->
     """Return a fit with another component in place of one of the chain, where that is better."""
     best: tuple[float, Fit] | None = None
     for one, plainer in _optional(found, data):
-        bare = quick(data, plainer, found)
+        bare = fit_roughly(data, plainer, found)
         worth = gain_of(data, bare.linear, found.linear.residual) - policy.price(one, 100.0)
         others = [c for c in screen(bare, data, policy) if c.component.code != one.code]
         other = _fitted(bare, data, others, replace(policy, tried=2), say)
@@ -395,17 +395,17 @@ def _best_exchange(found: Fit, data: Data, policy: SelectionPolicy, say: Say) ->
             and (best is None or other[0] - worth > best[0])
         ):
             best = other[0] - worth, other[1]
-    return None if best is None else _renewed(data, best[1])
+    return None if best is None else _refit_noise(data, best[1])
 
 
-def _without_needless(found: Fit, data: Data, policy: SelectionPolicy) -> Fit:
+def _drop_needless(found: Fit, data: Data, policy: SelectionPolicy) -> Fit:
     """Return the fit without components that do not earn their price."""
     while True:
         best: tuple[float, Fit] | None = None
         for one, plainer in _optional(found, data):
-            if _deviations(found, one) > CERTAIN:
+            if _distance_from_none(found, one) > CERTAIN:
                 continue
-            bare = quick(data, plainer, found)
+            bare = fit_roughly(data, plainer, found)
             net = policy.price(one, 100.0) - gain_of(data, bare.linear, found.linear.residual)
             if net > 0 and (best is None or net > best[0]):
                 best = net, bare
@@ -414,7 +414,7 @@ def _without_needless(found: Fit, data: Data, policy: SelectionPolicy) -> Fit:
         found = best[1]
 
 
-def _deviations(found: Fit, one: Component) -> float:
+def _distance_from_none(found: Fit, one: Component) -> float:
     """Return the distance of a component's size from none, in standard deviations."""
     p = next((p for p in one.parameters if p.name == one.linear and p.name in found.names), None)
     if p is None:
@@ -446,5 +446,7 @@ def _is_negligible(data: Data, found: Fit, one: Component, plainer: Chain) -> bo
         return True
     if one.severity == "note" or off > 3 * math.sqrt(found.covariance[k, k]):
         return False
-    bare = quick(data, plainer, found)  # a size that no derivative tells may be needed all the same
+    bare = fit_roughly(
+        data, plainer, found
+    )  # a size that no derivative tells may be needed all the same
     return gain_of(data, bare.linear, found.linear.residual) < 9.0

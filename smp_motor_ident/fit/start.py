@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where a fit begins: a grid of motors, simulated at once, gain profiled.
+"""Starting values of a fit: a grid of motors, simulated at once, with the best gain of each.
 
 The grid covers the whole record at a coarse step, and its first rows at their own.
 """
@@ -46,9 +46,9 @@ def guesses(data: Data, best: int = 3, component: Component | None = None) -> li
     """
     scored: list[tuple[float, Chain]] = []
     for view in views(data):
-        scored += _scored(view, component, DELAYS if component is None else (0.0,))
+        scored += _score_grid(view, component, DELAYS if component is None else (0.0,))
         if component is None and min((cost for cost, _ in scored), default=1.0) > POOR:
-            scored += _scored(view, _LongDelay(), (0.0,))
+            scored += _score_grid(view, _LongDelay(), (0.0,))
     scored.sort(key=lambda one: one[0])
     found: list[Chain] = []
     for _, chain in scored:
@@ -77,7 +77,7 @@ def views(data: Data) -> Iterator[Data]:
     yield _held(data, rows.time[first:last], held[first:last], data.motion[first:last])
     every = -(-len(data) // ROWS)
     if every > 1 or rows.segment.size > 2:
-        yield _averaged(data, held, every)
+        yield _average_rows(data, held, every)
 
 
 def filled(values: Array, segment: Integers) -> Array:
@@ -108,7 +108,7 @@ def _held(
     return replace(data, rows=rows, motion=motion, current=None, initial=start, stood=still)
 
 
-def _averaged(data: Data, held: Array, every: int) -> Data:
+def _average_rows(data: Data, held: Array, every: int) -> Data:
     """Return every so many rows of all segments, each command the mean since the row before."""
     rows = data.rows
     times, commands, outputs, starts = [], [], [], [0]
@@ -129,7 +129,7 @@ def _averaged(data: Data, held: Array, every: int) -> Data:
     return _held(data, time, command, motion, np.array(starts))
 
 
-def _scored(
+def _score_grid(
     data: Data, component: Component | None, delays: Sequence[float]
 ) -> list[tuple[float, Chain]]:
     """Return every motor of the grid with its cost, as a share of the output's own."""

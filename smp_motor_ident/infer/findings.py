@@ -168,7 +168,8 @@ def _fit(judged: Judged) -> Iterator[Finding]:
             f"the model explains {estimation:.0f} % of the speed; at least "
             f"{limits.FIT_EXPLAINS.value:.0f} % are expected",
             {"fit_percent": estimation, "limit": limits.FIT_EXPLAINS.value},
-            "look for another drive of the motor, and record the driver's output voltage",
+            "look for a second cause of the motion, such as a load, and record the driver's output "
+            "voltage",
         )  # fmt: skip
     fitted = judged.percent.estimation or 0.0
     falls = validation is not None and validation < fitted - limits.FIT_HOLDS.value
@@ -339,8 +340,8 @@ def _driving_load(judged: Judged) -> Iterator[Finding]:
     if way * load.value < -2 * (load.std or 0.0):
         yield Finding(
             "driving_load", "unreliable",
-            "the motor responds to changes of the voltage by less than its steady speed requires: "
-            f"a load of {abs(load.value):.3g} V seems to drive it",
+            "the steady speed is higher than the response to changes of the voltage explains: "
+            f"a load of {abs(load.value):.3g} V seems to drive the motor",
             {"load_voltage": load.value},
             "drive both directions, or record the voltage at the terminals",
         )  # fmt: skip
@@ -357,7 +358,7 @@ def _current_offset(judged: Judged) -> Iterator[Finding]:
     if abs(offset) > max(4 * std, 0.01 * float(np.nanmax(np.abs(current)))):
         yield Finding(
             "current_offset", "note",
-            f"the current has an offset of {offset:.3g} ± {std:.1g} A, which was taken out",
+            f"the current has an offset of {offset:.3g} ± {std:.1g} A, which was subtracted",
             {"offset": offset}, "zero the current sensor at rest",
         )  # fmt: skip
 
@@ -373,7 +374,7 @@ def _current_scale(judged: Judged) -> Iterator[Finding]:
     found = judged.quantity("resistance")
     evidence: dict[str, float | str | None] = {"of_the_scale": ", ".join(known)}
     names = ", ".join(n.replace("_", " ") for n in known)
-    text = f"{names} scale with the current sensor"
+    text = f"{names} depend on the scale of the current sensor"
     if not ohmmeter or found is None or found.value is None:
         share = max((s.share or 0.0 for s in found.systematic if s.cause == "current_scale"),
                     default=0.0) if found else 0.0  # fmt: skip
@@ -407,8 +408,9 @@ def _torque_noise(judged: Judged) -> Iterator[Finding]:
     yield Finding(
         "torque_noise", "note",
         f"the load fluctuates: the acceleration scatters by {acceleration:.3g} rad/s^2 over a "
-        "second",
+        "second, which limits the accuracy",
         {"acceleration": acceleration},
+        "hold the load constant, or record longer",
     )  # fmt: skip
 
 
@@ -443,7 +445,7 @@ def _separable(judged: Judged) -> Iterator[Finding]:
         yield Finding(
             "not_separable", "note",
             f"voltage and speed alone cannot separate {names}: many motors respond alike",
-            {}, "record the motor current too; the combinations are known",
+            {}, "record the motor current too, or use the combinations, which are known",
         )  # fmt: skip
     else:
         yield Finding(

@@ -32,7 +32,7 @@ def residual_tests(data: Data, found: Fit) -> ResidualTests:
     With 95 % confidence all correlations at up to `LAGS` lags stay inside the band.
     """
     error = model_error(data, found)
-    e, band = _centred(_whitened(data, found))
+    e, band = _centre(_whitened(data, found))
     command = command_of(data.rows)
     u = (command - command.mean())[:MAX_ROWS]
     if e.std() == 0 or u.std() == 0:
@@ -63,7 +63,7 @@ def _whitened(data: Data, found: Fit) -> Array:
     return out
 
 
-def _centred(error: Array) -> tuple[Array, float]:
+def _centre(error: Array) -> tuple[Array, float]:
     """Return errors without their mean, zero where missing or too few, and their band."""
     ok = np.isfinite(error)
     n = int(ok[:MAX_ROWS].sum())

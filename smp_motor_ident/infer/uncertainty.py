@@ -26,7 +26,7 @@ from smp_motor_ident.fit.descend import Fit, residual, restate
 from smp_motor_ident.fit.search import (
     SelectionPolicy,
     candidates,
-    quick,
+    fit_roughly,
     relabelled,
     typical_size,
 )
@@ -126,7 +126,7 @@ def of_relabelled(data: Data, found: Fit) -> Iterator[Contribution]:
     and the priors of both, tell how probable the other is.
     """
     for one, chain in relabelled(found, data):
-        other = quick(data, chain, found)
+        other = fit_roughly(data, chain, found)
         odds = one.prior / (1 - one.prior)
         odds *= math.exp(min(0.5 * (found.linear.cost - other.linear.cost), 50.0))
         weight = math.sqrt(odds / (1 + odds))

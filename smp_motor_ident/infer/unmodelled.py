@@ -123,8 +123,8 @@ def relative_error(omega: Array, error: Complex, output: Complex) -> ModelError 
             middle = float(np.sqrt(omega[a] * omega[b - 1]))
             filters = _filters(omega[a:b])
             stated = [_most_shown(error[a:b], one * filters) for one in moved]
-            most = max(stated, key=_surely)
-            found.append((middle, *(most if _surely(most) > 1 else stated[0])))
+            most = max(stated, key=_lower_limit)
+            found.append((middle, *(most if _lower_limit(most) > 1 else stated[0])))
     if not found:
         return None
     frequency, shown, radius = zip(*found, strict=True)
@@ -149,7 +149,7 @@ def _most_shown(error: Complex, outputs: Complex) -> tuple[float, float]:
     return float(size[most]), float(radius[most])
 
 
-def _surely(stated: tuple[float, float]) -> float:
+def _lower_limit(stated: tuple[float, float]) -> float:
     """Return the lower limit of an error from its size and radius."""
     return stated[0] - stated[1]
 

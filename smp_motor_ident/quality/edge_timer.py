@@ -39,12 +39,12 @@ def between_edges(record: Record) -> Record:
     count = _count_of(record, velocity)
     if count == 0.0:
         return record
-    known, share = _centred(record, velocity, count)
+    known, share = _centre(record, velocity, count)
     found = Finding(
         "edge_timer",
         "warning",
-        f"the speed is one count of {count:.3g} rad over its duration, held until the next count: "
-        f"it lags at low speed, and {share:.0%} of the readings were left out",
+        f"the speed is from the time of one count ({count:.3g} rad), held until the next: it lags "
+        f"at low speed; {share:.0%} of the readings were left out",
         {"count": count, "share": share},
         "record the encoder's counts",
     )
@@ -89,7 +89,7 @@ def _ticks(period: Array) -> bool:
     return bool(np.mean(np.abs(rest) < NEAR) > HELD.value)
 
 
-def _centred(record: Record, velocity: Array, count: float) -> tuple[Array, float]:
+def _centre(record: Record, velocity: Array, count: float) -> tuple[Array, float]:
     """Return the interpolated speed at the rows, and the share of rows without a value."""
     speed, step = np.nan_to_num(velocity), record.sample_time
     out = np.full(speed.size, np.nan)

@@ -7,7 +7,7 @@ from smp_motor_control.arrays import Array
 from smp_motor_ident.quality.limits import REST
 from smp_motor_ident.record import Record
 
-LONG = 2_000  # samples of rest: a quarter of the samples used by `start.resample`
+LONG = 2_000  # samples of rest that are worth removing
 MARGIN = 10  # samples of rest kept on either side
 SCATTER = 6.0  # standard deviations of sensor noise that do not count as motion
 

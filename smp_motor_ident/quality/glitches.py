@@ -48,7 +48,7 @@ def without_glitches(record: Record) -> Record:
     return record
 
 
-def glitches_of(record: Record, name: str) -> int:
+def count_glitches(record: Record, name: str) -> int:
     """Return the number of readings of a signal that were left out."""
     said = [f.evidence for f in record.findings if f.code == "glitches"]
     return sum(int(e["samples"] or 0) for e in said if e["signal"] == name)

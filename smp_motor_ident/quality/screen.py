@@ -10,9 +10,9 @@ from smp_motor_ident.errors import CurrentError, InsufficientExcitationError, Si
 from smp_motor_ident.finding import Finding
 from smp_motor_ident.quality import limits
 from smp_motor_ident.quality.edge_timer import held_of
-from smp_motor_ident.quality.glitches import glitches_of
+from smp_motor_ident.quality.glitches import count_glitches
 from smp_motor_ident.quality.saturation import saturation
-from smp_motor_ident.quality.signs import likeness, lost_sign
+from smp_motor_ident.quality.signs import likeness, refuse_lost_sign
 from smp_motor_ident.quality.silence import silent
 from smp_motor_ident.quality.units import (
     cause_of_ratio,
@@ -35,7 +35,7 @@ def screen(records: Sequence[Record]) -> list[Finding]:
     for record in records:
         warnings += _lost(record)
     _resolution(records, where)
-    lost_sign(records, [measured_speed(r) for r in records], where)
+    refuse_lost_sign(records, [measured_speed(r) for r in records], where)
     _excitation(records, where)
     for record in records:
         warnings += saturation(record, measured_speed(record), where_of([record]))
@@ -90,16 +90,16 @@ def _lost(record: Record) -> Iterator[Finding]:
                 f"{where}: {name} is NaN in {lost:.0%} of the samples; "
                 "repair the sensor or its connection and record again"
             )
-        lost -= glitches_of(record, name) / len(record)  # which are said already
+        lost -= count_glitches(record, name) / len(record)  # which are said already
         if lost > 0:
-            yield _left_out(name, lost)
+            yield _report_left_out(name, lost)
     if record.current is not None:
         lost = float(np.mean(~np.isfinite(record.current)))
         if 0 < lost < 1:
-            yield _left_out("current", lost)
+            yield _report_left_out("current", lost)
 
 
-def _left_out(name: str, lost: float) -> Finding:
+def _report_left_out(name: str, lost: float) -> Finding:
     message = f"{name} is NaN in {lost:.1%} of the samples; they were left out"
     return Finding("samples_lost", "warning", message, {"signal": name, "share": lost})
 

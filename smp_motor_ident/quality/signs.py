@@ -106,8 +106,9 @@ def _means(values: Array, k: int) -> Array:
 
 
 def _chance(v: Array, y: Array) -> float:
-    """Return the standard deviation of the correlation of two signals that have no part in
-    each other (Bartlett): the sum of the product of their autocorrelations over n.
+    """Return the standard deviation of the correlation of two independent signals (Bartlett).
+
+    It is the sum of the product of their autocorrelations over n.
     """
     size = next_fast_len(2 * len(v), real=True)
     own = [irfft(np.abs(rfft(x, size)) ** 2, size)[: len(v)] for x in (v, y)]
@@ -117,7 +118,7 @@ def _chance(v: Array, y: Array) -> float:
     return float(np.sqrt(max(1.0, 2 * product.sum() - 1) / len(v)))
 
 
-def lost_sign(records: Sequence[Record], speeds: Sequence[Array], where: str) -> None:
+def refuse_lost_sign(records: Sequence[Record], speeds: Sequence[Array], where: str) -> None:
     """Refuse signals whose sign was lost."""
     lowest = min(float(np.nanmin(r.voltage)) for r in records)
     ways = np.concatenate([_ways(r, w) for r, w in zip(records, speeds, strict=True)])

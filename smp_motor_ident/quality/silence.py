@@ -32,7 +32,7 @@ def silent(record: Record, where: str) -> None:
         )
 
 
-def without_silences(record: Record) -> Record:
+def remove_silences(record: Record) -> Record:
     """Return a record without intervals in which a sensor is silent.
 
     The rest determines the motor, whether the shaft was blocked or the encoder came loose.

@@ -211,8 +211,8 @@ def on_beat(record: Record) -> Record:
     finding = Finding(
         "arrival_beat",
         "note",
-        f"stamps were fitted to their period of {1e3 * period:.5g} ms (median latency "
-        f"{1e3 * latency:.3g} ms)",
+        f"stamps scattered with the transport (median latency {1e3 * latency:.3g} ms); they were "
+        f"fitted to their period of {1e3 * period:.5g} ms",
         {"period": period, "deviation": beat.deviation * 1e-9, "latency": latency},
         "stamp each sample where it is measured",
     )

@@ -70,7 +70,8 @@ def implausible_voltage(records: Sequence[Record]) -> list[Finding]:
             "whole_volts" if whole else "high_voltage",
             "unreliable" if whole or largest > LOW_VOLTAGE.value else "warning",
             f"the voltage {'is whole numbers' if whole else 'goes'} up to {largest:.4g}: it may be "
-            "a PWM's counts, percent or millivolts; gain and static voltage then have this unit",
+            "the counts of a PWM, percent or millivolts; gain and static voltage then have this "
+            "unit",
             {"largest": largest},
             "map it as voltage=COLUMN:pwm with pwm_full_scale and supply_voltage (or :% of it), "
             "or with its unit, such as voltage=COLUMN:mV",

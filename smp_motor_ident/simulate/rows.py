@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Rows of records as the simulation takes them: instants, segments and pieces of constant input."""
+"""Rows of records for the simulation: instants, segments and pieces of constant input."""
 
 from __future__ import annotations
 
