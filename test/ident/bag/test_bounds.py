@@ -9,7 +9,7 @@ import resource
 import subprocess
 import sys
 from pathlib import Path
-from types import ModuleType, SimpleNamespace
+from types import ModuleType
 
 import lz4.frame
 import numpy as np
@@ -17,6 +17,7 @@ import pytest
 from backports import zstd
 from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
+from recordings import assert_read, motion, write_mcap
 
 from smp_motor_ident.bag import read_records
 from smp_motor_ident.errors import BagError
@@ -115,17 +116,17 @@ def test_a_bomb_is_refused_within_bounded_memory(tmp_path: Path, kind: str) -> N
 
 
 def test_the_limit_can_be_raised_and_lowered(
-    tmp_path: Path, corpus: SimpleNamespace, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    truth = corpus.motion()
-    plain = corpus.write_mcap(tmp_path / "plain.mcap", truth.messages())
+    truth = motion()
+    plain = write_mcap(tmp_path / "plain.mcap", truth.messages())
     path = tmp_path / "bag.mcap.zstd"
     path.write_bytes(zstd.compress(plain.read_bytes()))
     monkeypatch.setenv("SMP_BAG_UNPACKED", "10K")
     with pytest.raises(BagError, match="SMP_BAG_UNPACKED"):
         read_records(path)
     monkeypatch.setenv("SMP_BAG_UNPACKED", "1G")
-    corpus.assert_read(read_records(path)["front_left"], truth)
+    assert_read(read_records(path)["front_left"], truth)
     monkeypatch.setenv("SMP_BAG_UNPACKED", "much")
     with pytest.raises(BagError, match="'MUCH'"):
         read_records(path)
@@ -143,7 +144,7 @@ def test_an_lz4_frame_that_lies_about_its_size_takes_no_memory(tmp_path: Path) -
 
 
 def test_the_second_frame_of_a_compressed_chunk_is_read(
-    tmp_path: Path, corpus: SimpleNamespace, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     import mcap.writer
 
@@ -154,9 +155,9 @@ def test_the_second_frame_of_a_compressed_chunk_is_read(
         return bytes(once(data[:half]) + once(data[half:]))
 
     monkeypatch.setattr(mcap.writer.zstandard, "compress", two_frames, raising=False)
-    truth = corpus.motion(n=100)
+    truth = motion(n=100)
     kind = mcap.writer.CompressionType.ZSTD
-    path = corpus.write_mcap(tmp_path / "bag.mcap", truth.messages(), compression=kind)
+    path = write_mcap(tmp_path / "bag.mcap", truth.messages(), compression=kind)
     record = read_records(path)["front_left"]
-    corpus.assert_read(record, truth)
+    assert_read(record, truth)
     np.testing.assert_array_equal(record.voltage, truth.voltage)

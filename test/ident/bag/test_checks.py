@@ -4,10 +4,10 @@
 from __future__ import annotations
 
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from recordings import START, TYPES, Sent, read, serialized
 
 from smp_motor_ident.bag import read_records
 from smp_motor_ident.errors import BagError
@@ -201,18 +201,18 @@ def test_a_command_that_has_a_sign_needs_no_direction(tmp_path: Path, direction:
     ],
 )
 def test_a_speed_command_mapped_as_a_voltage_is_told(
-    tmp_path: Path, corpus: SimpleNamespace, field: str, severity: str | None
+    tmp_path: Path, field: str, severity: str | None
 ) -> None:
     number, twist = "std_msgs/msg/Float64", "geometry_msgs/msg/Twist"
-    vector = corpus.TYPES.types["geometry_msgs/msg/Vector3"]
+    vector = TYPES.types["geometry_msgs/msg/Vector3"]
     topic, sent = field.split(".")[0], []
     for k in range(200):
-        at, value = corpus.START + 10**7 * k, float(k // 20 % 3)
-        data = corpus.serialized(number, data=value)
+        at, value = START + 10**7 * k, float(k // 20 % 3)
+        data = serialized(number, data=value)
         if topic == "/cmd_vel":
-            data = corpus.serialized(twist, linear=vector(value, 0, 0), angular=vector(0, 0, 0))
-        sent.append(corpus.Sent(topic, twist if topic == "/cmd_vel" else number, at, data))
-        sent.append(corpus.Sent("/w", number, at, corpus.serialized(number, data=value)))
-    record = corpus.read(tmp_path / "bag.mcap", sent, [f"voltage={field} velocity=/w.data"])
+            data = serialized(twist, linear=vector(value, 0, 0), angular=vector(0, 0, 0))
+        sent.append(Sent(topic, twist if topic == "/cmd_vel" else number, at, data))
+        sent.append(Sent("/w", number, at, serialized(number, data=value)))
+    record = read(tmp_path / "bag.mcap", sent, [f"voltage={field} velocity=/w.data"])
     found = [f.severity for f in record.findings if f.code == "speed_command"]
     assert found == ([] if severity is None else [severity])

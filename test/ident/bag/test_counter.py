@@ -5,12 +5,12 @@ from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from recordings import COUNTS, RATIO, motion, read
 
 from smp_motor_ident.bag import read_records
 from smp_motor_ident.bag.counter import Wrap, is_full, round_to_counts, unwrap, unwrap_angle
@@ -267,38 +267,34 @@ def test_a_counter_that_wraps_at_any_width_is_unwrapped(bits: int, seed: int, kn
 
 
 @pytest.mark.parametrize("bits", [16, 32])
-def test_a_wrapping_counter_in_a_bag_follows_its_description(
-    tmp_path: Path, corpus: SimpleNamespace, bits: int
-) -> None:
-    truth = corpus.motion(n=400, bits=bits)
+def test_a_wrapping_counter_in_a_bag_follows_its_description(tmp_path: Path, bits: int) -> None:
+    truth = motion(n=400, bits=bits)
     fast = 2 ** (bits - 3)
     truth = dataclasses.replace(truth, count=np.arange(400, dtype=np.int64) * fast - 3 * fast)
     # The measured speed agrees, as a motor's does.
-    rate = fast / 0.01 * 2 * np.pi / corpus.COUNTS / corpus.RATIO
+    rate = fast / 0.01 * 2 * np.pi / COUNTS / RATIO
     truth = dataclasses.replace(truth, velocity=np.full(400, rate))
-    record = corpus.read(tmp_path / "bag.mcap", truth.messages())
+    record = read(tmp_path / "bag.mcap", truth.messages())
     np.testing.assert_array_equal(np.diff(record.count), fast)
     assert record.starts == (0,)
 
 
-def test_a_narrow_counter_faster_than_half_its_range_follows_the_speed(
-    tmp_path: Path, corpus: SimpleNamespace
-) -> None:
-    truth = corpus.motion(n=200, bits=8)
+def test_a_narrow_counter_faster_than_half_its_range_follows_the_speed(tmp_path: Path) -> None:
+    truth = motion(n=200, bits=8)
     count = np.arange(200, dtype=np.int64) * 700  # 2.7 ranges a sample
-    rate = 700 / 0.01 * 2 * np.pi / corpus.COUNTS / corpus.RATIO
+    rate = 700 / 0.01 * 2 * np.pi / COUNTS / RATIO
     truth = dataclasses.replace(truth, count=count, velocity=np.full(200, rate))
-    record = corpus.read(tmp_path / "bag.mcap", truth.messages())
+    record = read(tmp_path / "bag.mcap", truth.messages())
     np.testing.assert_array_equal(record.count - record.count[0], count)
 
 
-def test_a_reset_counter_begins_a_new_segment(tmp_path: Path, corpus: SimpleNamespace) -> None:
-    truth = corpus.motion(n=300)
+def test_a_reset_counter_begins_a_new_segment(tmp_path: Path) -> None:
+    truth = motion(n=300)
     count = np.arange(300, dtype=np.int64) * 50 + 20_000
     count[120:] -= count[120]
-    rate = 50 / 0.01 * 2 * np.pi / corpus.COUNTS / corpus.RATIO
+    rate = 50 / 0.01 * 2 * np.pi / COUNTS / RATIO
     truth = dataclasses.replace(truth, count=count, velocity=np.full(300, rate))
-    record = corpus.read(tmp_path / "bag.mcap", truth.messages())
+    record = read(tmp_path / "bag.mcap", truth.messages())
     assert record.starts == (0, 120)
     assert np.all(np.diff(record.count)[np.arange(299) != 119] == 50)
     assert "reset 1 times" in " ".join(f.message for f in record.findings)

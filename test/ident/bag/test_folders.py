@@ -4,9 +4,9 @@
 from __future__ import annotations
 
 from pathlib import Path
-from types import SimpleNamespace
 
 import pytest
+from recordings import assert_read, motion, write_mcap, write_metadata, write_sqlite
 
 from smp_motor_ident.bag import read_experiments, read_records
 from smp_motor_ident.errors import BagError
@@ -22,46 +22,40 @@ def bag(tmp_path: Path) -> Path:
 
 @pytest.mark.parametrize("storage", ["mcap", "db3"])
 @pytest.mark.parametrize("described", [True, False])
-def test_split_bags_are_one_recording(
-    bag: Path, corpus: SimpleNamespace, storage: str, described: bool
-) -> None:
-    truth = corpus.motion(n=300)
+def test_split_bags_are_one_recording(bag: Path, storage: str, described: bool) -> None:
+    truth = motion(n=300)
     messages = truth.messages()
-    write = corpus.write_mcap if storage == "mcap" else corpus.write_sqlite
+    write = write_mcap if storage == "mcap" else write_sqlite
     # Ten and more: files must not be taken in the order of their letters.
     parts = [messages[k * 26 : (k + 1) * 26] for k in range(12)]
     files = [write(bag / f"bag_{k}.{storage}", part).name for k, part in enumerate(parts)]
     if described:
-        corpus.write_metadata(bag, files, messages, storage=storage)
+        write_metadata(bag, files, messages, storage=storage)
     record = read_records(bag)["front_left"]
-    corpus.assert_read(record, truth)
+    assert_read(record, truth)
     assert record.starts == (0,)
     assert ("metadata.yaml" in " ".join(f.message for f in record.findings)) is not described
 
 
-def test_a_missing_part_of_a_split_bag_is_told_with_its_messages(
-    bag: Path, corpus: SimpleNamespace
-) -> None:
-    truth = corpus.motion(n=300)
+def test_a_missing_part_of_a_split_bag_is_told_with_its_messages(bag: Path) -> None:
+    truth = motion(n=300)
     messages = truth.messages()
-    corpus.write_mcap(bag / "bag_0.mcap", messages[:101])
-    corpus.write_metadata(bag, ["bag_0.mcap", "bag_1.mcap"], messages)
+    write_mcap(bag / "bag_0.mcap", messages[:101])
+    write_metadata(bag, ["bag_0.mcap", "bag_1.mcap"], messages)
     record = read_records(bag)["front_left"]
-    corpus.assert_read(record, truth, 100)
+    assert_read(record, truth, 100)
     notes = " ".join(f.message for f in record.findings)
     assert "bag_1.mcap is missing" in notes
     assert "100 of 300 messages" in notes
 
 
-def test_a_damaged_part_of_a_split_bag_costs_only_itself(
-    bag: Path, corpus: SimpleNamespace
-) -> None:
-    truth = corpus.motion(n=300)
+def test_a_damaged_part_of_a_split_bag_costs_only_itself(bag: Path) -> None:
+    truth = motion(n=300)
     messages = truth.messages()
-    corpus.write_mcap(bag / "bag_0.mcap", messages[:101])
+    write_mcap(bag / "bag_0.mcap", messages[:101])
     (bag / "bag_1.mcap").write_bytes(b"")
-    corpus.write_mcap(bag / "bag_2.mcap", messages[201:])
-    corpus.write_metadata(bag, [f"bag_{k}.mcap" for k in range(3)], messages)
+    write_mcap(bag / "bag_2.mcap", messages[201:])
+    write_metadata(bag, [f"bag_{k}.mcap" for k in range(3)], messages)
     record = read_records(bag)["front_left"]
     assert len(record) == 200
     assert record.starts == (0, 100)
@@ -70,13 +64,13 @@ def test_a_damaged_part_of_a_split_bag_costs_only_itself(
     assert "200 of 300 messages" in notes
 
 
-def test_a_folder_of_bags_is_a_list_of_experiments(tmp_path: Path, corpus: SimpleNamespace) -> None:
-    truths = [corpus.motion(n=50 + k, seed=k) for k in range(3)]
+def test_a_folder_of_bags_is_a_list_of_experiments(tmp_path: Path) -> None:
+    truths = [motion(n=50 + k, seed=k) for k in range(3)]
     for k, truth in enumerate(truths):
         bag = tmp_path / f"run{k}"
         bag.mkdir()
-        corpus.write_sqlite(bag / "x_0.db3", truth.messages())
-        corpus.write_metadata(bag, ["x_0.db3"], truth.messages(), storage="sqlite3")
+        write_sqlite(bag / "x_0.db3", truth.messages())
+        write_metadata(bag, ["x_0.db3"], truth.messages(), storage="sqlite3")
     experiments = read_experiments(tmp_path)["front_left"]
     assert [len(record) for record in experiments] == [50, 51, 52]
     joined = read_records(tmp_path)["front_left"]
@@ -85,25 +79,21 @@ def test_a_folder_of_bags_is_a_list_of_experiments(tmp_path: Path, corpus: Simpl
     assert joined.source == "run0, run1, run2"
 
 
-def test_bare_files_of_different_names_in_a_folder_are_experiments(
-    tmp_path: Path, corpus: SimpleNamespace
-) -> None:
+def test_bare_files_of_different_names_in_a_folder_are_experiments(tmp_path: Path) -> None:
     for name in ("slow.mcap", "fast.mcap"):
-        corpus.write_mcap(tmp_path / name, corpus.motion(n=20).messages())
+        write_mcap(tmp_path / name, motion(n=20).messages())
     assert [r.source for r in read_experiments(tmp_path)["front_left"]] == [
         f"{tmp_path.name}/fast",
         f"{tmp_path.name}/slow",
     ]
 
 
-def test_fewer_messages_than_the_metadata_count_are_named(
-    tmp_path: Path, corpus: SimpleNamespace
-) -> None:
-    truth = corpus.motion()
+def test_fewer_messages_than_the_metadata_count_are_named(tmp_path: Path) -> None:
+    truth = motion()
     bag = tmp_path / "bag"
     bag.mkdir()
-    corpus.write_sqlite(bag / "bag_0.db3", truth.messages())
-    corpus.write_metadata(
+    write_sqlite(bag / "bag_0.db3", truth.messages())
+    write_metadata(
         bag,
         ["bag_0.db3"],
         truth.messages(),
@@ -121,12 +111,10 @@ def test_a_path_that_does_not_exist_and_an_empty_folder_are_refused(tmp_path: Pa
         read_records(tmp_path)
 
 
-def test_a_folder_of_bags_tells_which_of_them_could_not_be_read(
-    tmp_path: Path, corpus: SimpleNamespace
-) -> None:
+def test_a_folder_of_bags_tells_which_of_them_could_not_be_read(tmp_path: Path) -> None:
     for name in ("good", "bad"):
         (tmp_path / name).mkdir()
-        corpus.write_mcap(tmp_path / name / "x_0.mcap", corpus.motion(n=20).messages())
+        write_mcap(tmp_path / name / "x_0.mcap", motion(n=20).messages())
     (tmp_path / "bad" / "x_0.mcap").write_bytes(b"")
     records = read_experiments(tmp_path)["front_left"]
     assert [len(record) for record in records] == [20]
@@ -137,12 +125,10 @@ def test_a_folder_of_bags_tells_which_of_them_could_not_be_read(
 
 
 @pytest.mark.parametrize("text", ["", ":\n - {", "a: 1", "rosbag2_bagfile_information: 7"])
-def test_damaged_metadata_do_not_hide_the_files(
-    tmp_path: Path, corpus: SimpleNamespace, text: str
-) -> None:
-    truth = corpus.motion()
-    corpus.write_mcap(tmp_path / "x_0.mcap", truth.messages())
+def test_damaged_metadata_do_not_hide_the_files(tmp_path: Path, text: str) -> None:
+    truth = motion()
+    write_mcap(tmp_path / "x_0.mcap", truth.messages())
     (tmp_path / "metadata.yaml").write_text(text)
     record = read_records(tmp_path)["front_left"]
-    corpus.assert_read(record, truth)
+    assert_read(record, truth)
     assert "metadata.yaml is damaged" in " ".join(f.message for f in record.findings)

@@ -10,12 +10,24 @@ import struct
 import warnings
 from collections.abc import Callable
 from pathlib import Path
-from types import SimpleNamespace
 
 import lz4.frame
 import mcap.writer
 import pytest
 from backports import zstd
+from recordings import (
+    START,
+    TYPES,
+    Sent,
+    assert_read,
+    header,
+    merged,
+    motion,
+    serialized,
+    write_mcap,
+    write_metadata,
+    write_sqlite,
+)
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 
 from smp_motor_ident.bag import list_topics, read_records
@@ -31,26 +43,24 @@ PACKERS: dict[str, Pack] = {
 
 @pytest.mark.parametrize("pack", PACKERS)
 @pytest.mark.parametrize("storage", ["mcap", "db3"])
-def test_messages_compressed_one_by_one_are_read(
-    tmp_path: Path, corpus: SimpleNamespace, storage: str, pack: str
-) -> None:
-    truth = corpus.motion()
-    write = corpus.write_mcap if storage == "mcap" else corpus.write_sqlite
+def test_messages_compressed_one_by_one_are_read(tmp_path: Path, storage: str, pack: str) -> None:
+    truth = motion()
+    write = write_mcap if storage == "mcap" else write_sqlite
     path = write(tmp_path / f"bag.{storage}", truth.messages(), encode=PACKERS[pack])
     records = read_records(path)
-    corpus.assert_read(records["front_left"], truth)
+    assert_read(records["front_left"], truth)
 
 
 @pytest.mark.parametrize("pack", PACKERS)
 @pytest.mark.parametrize("storage", ["mcap", "db3"])
 @pytest.mark.parametrize("bare", [True, False])
 def test_files_compressed_as_a_whole_are_read(
-    tmp_path: Path, corpus: SimpleNamespace, storage: str, pack: str, bare: bool
+    tmp_path: Path, storage: str, pack: str, bare: bool
 ) -> None:
-    truth = corpus.motion()
+    truth = motion()
     bag = tmp_path / "bag"
     bag.mkdir()
-    write = corpus.write_mcap if storage == "mcap" else corpus.write_sqlite
+    write = write_mcap if storage == "mcap" else write_sqlite
     plain = write(bag / f"bag_0.{storage}", truth.messages())
     file = plain
     if pack != "plain":
@@ -58,7 +68,7 @@ def test_files_compressed_as_a_whole_are_read(
         file.write_bytes(PACKERS[pack](plain.read_bytes()))
         plain.unlink()
     if not bare:
-        corpus.write_metadata(
+        write_metadata(
             bag,
             [file.name],
             truth.messages(),
@@ -66,7 +76,7 @@ def test_files_compressed_as_a_whole_are_read(
             compression=(pack, "FILE") if pack != "plain" else ("", ""),
         )
     records = read_records(file if bare else bag)
-    corpus.assert_read(records["front_left"], truth)
+    assert_read(records["front_left"], truth)
 
 
 @pytest.mark.parametrize("compression", mcap.writer.CompressionType)
@@ -74,15 +84,14 @@ def test_files_compressed_as_a_whole_are_read(
 @pytest.mark.parametrize("indexed", [True, False])
 def test_chunks_of_every_compression_are_read(
     tmp_path: Path,
-    corpus: SimpleNamespace,
     compression: mcap.writer.CompressionType,
     chunked: bool,
     indexed: bool,
 ) -> None:
-    truth, other = corpus.motion(seed=2), corpus.motion(wheel="rear_left", seed=3)
-    path = corpus.write_mcap(
+    truth, other = motion(seed=2), motion(wheel="rear_left", seed=3)
+    path = write_mcap(
         tmp_path / "bag.mcap",
-        corpus.merged(truth, other),
+        merged(truth, other),
         compression=compression,
         use_chunking=chunked,
         index_types=mcap.writer.IndexType.ALL if indexed else mcap.writer.IndexType.NONE,
@@ -91,25 +100,25 @@ def test_chunks_of_every_compression_are_read(
         use_statistics=indexed,
     )
     records = read_records(path)
-    corpus.assert_read(records["front_left"], truth)
-    corpus.assert_read(records["rear_left"], other)
+    assert_read(records["front_left"], truth)
+    assert_read(records["rear_left"], other)
 
 
 @pytest.mark.parametrize("version", range(1, 10))
 @pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
 def test_metadata_of_every_version_are_understood(
-    tmp_path: Path, corpus: SimpleNamespace, version: int, storage: str
+    tmp_path: Path, version: int, storage: str
 ) -> None:
-    truth = corpus.motion()
+    truth = motion()
     bag = tmp_path / "bag"
     bag.mkdir()
     if storage == "mcap":
-        file = corpus.write_mcap(bag / "bag_0.mcap", truth.messages())
+        file = write_mcap(bag / "bag_0.mcap", truth.messages())
     else:
         schema = 1 if version < 4 else 2 if version < 6 else 3 if version < 7 else 4
-        file = corpus.write_sqlite(bag / "bag_0.db3", truth.messages(), schema=schema)
-    corpus.write_metadata(bag, [file.name], truth.messages(), version=version, storage=storage)
-    corpus.assert_read(read_records(bag)["front_left"], truth)
+        file = write_sqlite(bag / "bag_0.db3", truth.messages(), schema=schema)
+    write_metadata(bag, [file.name], truth.messages(), version=version, storage=storage)
+    assert_read(read_records(bag)["front_left"], truth)
 
 
 @pytest.mark.parametrize("plugin", StoragePlugin)
@@ -117,14 +126,13 @@ def test_metadata_of_every_version_are_understood(
 @pytest.mark.parametrize("version", [8, 9])
 def test_bags_of_rosbags_are_read(
     tmp_path: Path,
-    corpus: SimpleNamespace,
     plugin: StoragePlugin,
     mode: CompressionMode,
     version: int,
 ) -> None:
     if plugin == StoragePlugin.SQLITE3 and mode == CompressionMode.STORAGE:
         pytest.skip("SQLite has no compression of its own")
-    truth = corpus.motion()
+    truth = motion()
     writer = Writer(tmp_path / "bag", version=version, storage_plugin=plugin)
     writer.set_compression(mode, CompressionFormat.ZSTD)
     with writer:
@@ -132,31 +140,27 @@ def test_bags_of_rosbags_are_read(
         for sent in truth.messages():
             if sent.topic not in connections:
                 connections[sent.topic] = writer.add_connection(
-                    sent.topic, sent.type, typestore=corpus.TYPES
+                    sent.topic, sent.type, typestore=TYPES
                 )
             writer.write(connections[sent.topic], sent.stamp, sent.data)
-    corpus.assert_read(read_records(tmp_path / "bag")["front_left"], truth)
+    assert_read(read_records(tmp_path / "bag")["front_left"], truth)
 
 
-def test_qos_that_disagrees_between_metadata_and_file_hides_nothing(
-    tmp_path: Path, corpus: SimpleNamespace
-) -> None:
-    truth = corpus.motion()
+def test_qos_that_disagrees_between_metadata_and_file_hides_nothing(tmp_path: Path) -> None:
+    truth = motion()
     tmp_path.joinpath("bag").mkdir()
     bag = tmp_path / "bag"
-    corpus.write_sqlite(bag / "bag_0.db3", truth.messages(), qos="- history: 3\n  depth: 0\n")
-    corpus.write_metadata(
+    write_sqlite(bag / "bag_0.db3", truth.messages(), qos="- history: 3\n  depth: 0\n")
+    write_metadata(
         bag, ["bag_0.db3"], truth.messages(), version=5, storage="sqlite3", qos="- history: 1\n"
     )
-    corpus.assert_read(read_records(bag)["front_left"], truth)
+    assert_read(read_records(bag)["front_left"], truth)
 
 
-def test_messages_that_only_the_journal_holds_are_read(
-    tmp_path: Path, corpus: SimpleNamespace
-) -> None:
-    truth = corpus.motion()
+def test_messages_that_only_the_journal_holds_are_read(tmp_path: Path) -> None:
+    truth = motion()
     messages = truth.messages()
-    path = corpus.write_sqlite(tmp_path / "bag.db3", messages[:101])
+    path = write_sqlite(tmp_path / "bag.db3", messages[:101])
     database = sqlite3.connect(path)
     database.execute("PRAGMA journal_mode=WAL")
     database.execute("PRAGMA wal_autocheckpoint=0")
@@ -178,18 +182,18 @@ def test_messages_that_only_the_journal_holds_are_read(
         record = read_records(dead / "bag.db3")["front_left"]
         gc.collect()
     assert not [str(one.message) for one in left if one.category is ResourceWarning]
-    corpus.assert_read(record, truth)
+    assert_read(record, truth)
     assert "journal" in " ".join(f.message for f in record.findings)
     assert (dead / "bag.db3").read_bytes() == before
 
 
 def test_a_message_that_changed_between_distributions_is_read_by_the_fitting_definition(
-    tmp_path: Path, corpus: SimpleNamespace
+    tmp_path: Path,
 ) -> None:
     # Range of Foxy has no field `variance`; the bag does not define it.
-    whole = corpus.serialized(
+    whole = serialized(
         "sensor_msgs/msg/Range",
-        header=corpus.header(corpus.START, "x"),
+        header=header(START, "x"),
         radiation_type=0,
         field_of_view=1.0,
         min_range=0.0,
@@ -198,10 +202,10 @@ def test_a_message_that_changed_between_distributions_is_read_by_the_fitting_def
         variance=7.0,
     )
     sent = [
-        corpus.Sent("/range", "sensor_msgs/msg/Range", corpus.START + k * 10_000_000, whole[:-4])
+        Sent("/range", "sensor_msgs/msg/Range", START + k * 10_000_000, whole[:-4])
         for k in range(10)
     ]
-    path = corpus.write_sqlite(tmp_path / "foxy.db3", sent, schema=2)
+    path = write_sqlite(tmp_path / "foxy.db3", sent, schema=2)
     offers = list_topics(path)[0].offers
     assert "range" in offers[0].fields
     assert "variance" not in offers[0].fields
@@ -233,26 +237,22 @@ def test_files_that_are_not_bags_are_refused_with_the_reason(
 
 
 @pytest.mark.parametrize("storage", ["mcap", "db3"])
-def test_an_empty_bag_is_refused_with_the_missing_topics(
-    tmp_path: Path, corpus: SimpleNamespace, storage: str
-) -> None:
-    write = corpus.write_mcap if storage == "mcap" else corpus.write_sqlite
+def test_an_empty_bag_is_refused_with_the_missing_topics(tmp_path: Path, storage: str) -> None:
+    write = write_mcap if storage == "mcap" else write_sqlite
     path = write(tmp_path / f"bag.{storage}", [])
     with pytest.raises(BagError, match="no topics at all"):
         read_records(path)
 
 
-def test_a_topic_without_messages_is_refused_by_its_name(
-    tmp_path: Path, corpus: SimpleNamespace
-) -> None:
-    path = corpus.write_sqlite(tmp_path / "bag.db3", corpus.motion(n=20).messages())
+def test_a_topic_without_messages_is_refused_by_its_name(tmp_path: Path) -> None:
+    path = write_sqlite(tmp_path / "bag.db3", motion(n=20).messages())
     with sqlite3.connect(path) as database:
         database.execute("DELETE FROM messages WHERE topic_id = 2")
     with pytest.raises(BagError, match="/front_left/motor_state has no messages"):
         read_records(path)
 
 
-def test_types_defined_as_idl_are_understood(tmp_path: Path, corpus: SimpleNamespace) -> None:
+def test_types_defined_as_idl_are_understood(tmp_path: Path) -> None:
     text = (
         "module odd_msgs {\n module msg {\n  struct Speed {\n   string label;\n"
         '   sequence<double> values;\n   @unit(value="V")\n   float volts;\n  };\n };\n};\n'
@@ -274,12 +274,10 @@ def test_types_defined_as_idl_are_understood(tmp_path: Path, corpus: SimpleNames
     assert set(record.voltage) == {4.0}
 
 
-def test_a_wheel_that_never_spoke_does_not_hide_the_others(
-    tmp_path: Path, corpus: SimpleNamespace
-) -> None:
-    silent = corpus.motion(n=20, wheel="rear_left").messages()
-    spoken = corpus.motion(n=20).messages()
-    path = corpus.write_sqlite(tmp_path / "bag.db3", spoken + silent)
+def test_a_wheel_that_never_spoke_does_not_hide_the_others(tmp_path: Path) -> None:
+    silent = motion(n=20, wheel="rear_left").messages()
+    spoken = motion(n=20).messages()
+    path = write_sqlite(tmp_path / "bag.db3", spoken + silent)
     with sqlite3.connect(path) as database:
         database.execute("DELETE FROM messages WHERE topic_id = 4")
     records = read_records(path)

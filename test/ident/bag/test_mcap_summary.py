@@ -7,11 +7,11 @@ import struct
 import subprocess
 import sys
 from pathlib import Path
-from types import SimpleNamespace
 
 import mcap.writer
 import pytest
 from mcap.reader import SeekingReader
+from recordings import merged, motion, write_mcap
 
 from smp_motor_ident.bag import read_records
 from smp_motor_ident.bag.readers.mcap_records import read_summary
@@ -33,9 +33,9 @@ ZSTD = mcap.writer.CompressionType.ZSTD
     ],
     ids=str,
 )
-def test_summary_is_that_of_the_mcap_library(tmp_path: Path, corpus: SimpleNamespace, options):
-    messages = corpus.merged(corpus.motion(n=100), corpus.motion(n=70, wheel="rear_right", seed=2))
-    path = corpus.write_mcap(tmp_path / "bag.mcap", messages, **options)
+def test_summary_is_that_of_the_mcap_library(tmp_path: Path, options):
+    messages = merged(motion(n=100), motion(n=70, wheel="rear_right", seed=2))
+    path = write_mcap(tmp_path / "bag.mcap", messages, **options)
     with path.open("rb") as file:
         found = read_summary(file)
         file.seek(0)
@@ -59,10 +59,8 @@ def test_summary_is_that_of_the_mcap_library(tmp_path: Path, corpus: SimpleNames
     assert len(read_records(path)["rear_right"]) == 70
 
 
-def test_damage_to_any_byte_of_the_summary_loses_no_message_silently(
-    tmp_path: Path, corpus: SimpleNamespace
-):
-    path = corpus.write_mcap(tmp_path / "bag.mcap", corpus.motion(n=60).messages(), defined=False)
+def test_damage_to_any_byte_of_the_summary_loses_no_message_silently(tmp_path: Path):
+    path = write_mcap(tmp_path / "bag.mcap", motion(n=60).messages(), defined=False)
     whole = path.read_bytes()
     (begin,) = struct.unpack_from("<Q", whole, len(whole) - 28)  # the footer's summary_start
     for at in range(begin, len(whole)):
@@ -78,10 +76,8 @@ def test_damage_to_any_byte_of_the_summary_loses_no_message_silently(
         assert path.name in told, at
 
 
-def test_compressed_bags_are_read_without_the_package_mcap(tmp_path, corpus: SimpleNamespace):
-    path = corpus.write_mcap(
-        tmp_path / "bag.mcap", corpus.motion(n=60).messages(), compression=ZSTD
-    )
+def test_compressed_bags_are_read_without_the_package_mcap(tmp_path):
+    path = write_mcap(tmp_path / "bag.mcap", motion(n=60).messages(), compression=ZSTD)
     program = (
         "import sys\nsys.modules['mcap'] = sys.modules['zstandard'] = None\n"
         "from smp_motor_ident.bag import read_records\n"

@@ -5,11 +5,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import scipy.io
+from recordings import START, TYPES, Sent, header, serialized, write_mcap
 
 from smp_motor_ident.bag import Listing, list_topics, read_records
 from smp_motor_ident.errors import BagError
@@ -35,34 +35,30 @@ def write(path: Path, **columns: Sequence[float]) -> Path:
     return path
 
 
-def test_a_bag_of_two_wheels_is_mapped_and_the_pwms_full_scale_asked_for(
-    tmp_path: Path, corpus: SimpleNamespace
-) -> None:
+def test_a_bag_of_two_wheels_is_mapped_and_the_pwms_full_scale_asked_for(tmp_path: Path) -> None:
     (u, y), (v, z) = motor(1), motor(2)
     number, joints = "std_msgs/msg/Float64", "sensor_msgs/msg/JointState"
     twist = "geometry_msgs/msg/Twist"
-    vector = corpus.TYPES.types["geometry_msgs/msg/Vector3"]
+    vector = TYPES.types["geometry_msgs/msg/Vector3"]
     sent = []
     for k in range(N):
-        at = corpus.START + round(1e9 * T[k])
+        at = START + round(1e9 * T[k])
         for topic, value in (("/left/pwm", u[k]), ("/right/pwm", v[k])):
-            data = corpus.serialized(number, data=float(round(value / 12 * 32767)))
-            sent.append(corpus.Sent(topic, number, at, data))
+            data = serialized(number, data=float(round(value / 12 * 32767)))
+            sent.append(Sent(topic, number, at, data))
         speeds = np.array([y[k], z[k]])
-        data = corpus.serialized(
+        data = serialized(
             joints,
-            header=corpus.header(at),
+            header=header(at),
             name=["left_wheel", "right_wheel"],
             position=np.zeros(0),
             velocity=speeds,
             effort=np.zeros(0),
         )
-        sent.append(corpus.Sent("/joint_states", joints, at, data))
-        data = corpus.serialized(
-            twist, linear=vector(u[k], 0.0, 0.0), angular=vector(0.0, 0.0, 0.0)
-        )
-        sent.append(corpus.Sent("/cmd_vel", twist, at, data))
-    listing = list_topics(corpus.write_mcap(tmp_path / "bag.mcap", sent))[0]
+        sent.append(Sent("/joint_states", joints, at, data))
+        data = serialized(twist, linear=vector(u[k], 0.0, 0.0), angular=vector(0.0, 0.0, 0.0))
+        sent.append(Sent("/cmd_vel", twist, at, data))
+    listing = list_topics(write_mcap(tmp_path / "bag.mcap", sent))[0]
     assert listing.suggestion == [
         "left.voltage=/left/pwm.data:pwm",
         "left.velocity=/joint_states.velocity[left_wheel]",
@@ -363,21 +359,19 @@ def test_an_angle_that_starts_again_at_360_is_in_degrees(tmp_path: Path) -> None
     assert listing.suggestion[1] == "position=angle:deg"
 
 
-def robot(
-    corpus: SimpleNamespace, space: str, efforts: np.ndarray, seed: int, drive: str = "pwm"
-) -> list[object]:
+def robot(space: str, efforts: np.ndarray, seed: int, drive: str = "pwm") -> list[object]:
     """Return the messages of one wheel: joint states with an effort, and its command."""
     number, joints = "std_msgs/msg/Float64", "sensor_msgs/msg/JointState"
     voltage, speed = motor(seed)
     sent = []
     for k in range(N):
-        at = corpus.START + round(1e9 * T[k])
-        data = corpus.serialized(number, data=float(np.rint(voltage[k] / 12 * 255)))
-        sent.append(corpus.Sent(f"{space}/{drive}", number, at, data))
+        at = START + round(1e9 * T[k])
+        data = serialized(number, data=float(np.rint(voltage[k] / 12 * 255)))
+        sent.append(Sent(f"{space}/{drive}", number, at, data))
         joint = dict(name=["left_wheel"], position=np.zeros(0), velocity=speed[k : k + 1])
         effort = efforts[k : k + 1]
-        data = corpus.serialized(joints, header=corpus.header(at), effort=effort, **joint)
-        sent.append(corpus.Sent(f"{space}/joint_states", joints, at, data))
+        data = serialized(joints, header=header(at), effort=effort, **joint)
+        sent.append(Sent(f"{space}/joint_states", joints, at, data))
     return sent
 
 
@@ -391,10 +385,10 @@ def efforts(kind: str, seed: int = 1) -> np.ndarray:
 @pytest.mark.parametrize("kind", ["zeros", "nan", "current"])
 @pytest.mark.parametrize("drive", ["pwm", "wheel_command"])
 def test_an_effort_is_not_proposed_in_place_of_the_drive(
-    tmp_path: Path, corpus: SimpleNamespace, kind: str, drive: str
+    tmp_path: Path, kind: str, drive: str
 ) -> None:
-    sent = robot(corpus, "", efforts(kind), 1, drive)
-    listing = list_topics(corpus.write_mcap(tmp_path / "bag.mcap", sent))[0]
+    sent = robot("", efforts(kind), 1, drive)
+    listing = list_topics(write_mcap(tmp_path / "bag.mcap", sent))[0]
     assert listing.suggestion == [
         f"left.voltage=/{drive}.data:pwm",
         "left.velocity=/joint_states.velocity[left_wheel]",
@@ -402,18 +396,16 @@ def test_an_effort_is_not_proposed_in_place_of_the_drive(
     assert asked(listing) == ["pwm_full_scale", "supply_voltage"]
 
 
-def test_an_effort_that_alone_explains_the_motion_is_proposed_with_a_note(
-    tmp_path: Path, corpus: SimpleNamespace
-) -> None:
-    sent = [s for s in robot(corpus, "", motor(1)[0], 1) if "pwm" not in s.topic]
-    listing = list_topics(corpus.write_mcap(tmp_path / "bag.mcap", sent))[0]
+def test_an_effort_that_alone_explains_the_motion_is_proposed_with_a_note(tmp_path: Path) -> None:
+    sent = [s for s in robot("", motor(1)[0], 1) if "pwm" not in s.topic]
+    listing = list_topics(write_mcap(tmp_path / "bag.mcap", sent))[0]
     assert listing.suggestion[0] == "left.voltage=/joint_states.effort[left_wheel]"
     assert "is a torque [N m] by its message's documentation" in listing.remark
 
 
-def test_every_robot_of_a_bag_is_proposed(tmp_path: Path, corpus: SimpleNamespace) -> None:
-    both = [m for k in (1, 2) for m in robot(corpus, f"/robot{k}", np.zeros(N), k)]
-    path = corpus.write_mcap(tmp_path / "bag.mcap", sorted(both, key=lambda m: m.stamp))
+def test_every_robot_of_a_bag_is_proposed(tmp_path: Path) -> None:
+    both = [m for k in (1, 2) for m in robot(f"/robot{k}", np.zeros(N), k)]
+    path = write_mcap(tmp_path / "bag.mcap", sorted(both, key=lambda m: m.stamp))
     listing = list_topics(path)[0]
     assert listing.suggestion == [
         f"robot{k}_left.{what}"

@@ -5,11 +5,22 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
+from recordings import (
+    COUNTS,
+    RATIO,
+    START,
+    STATE,
+    Sent,
+    header,
+    motion,
+    serialized,
+    write_mcap,
+    write_sqlite,
+)
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from smp_motor_ident.bag import list_topics, read_records
@@ -18,34 +29,32 @@ from smp_motor_ident.errors import BagError
 STEP = 10_000_000
 
 
-def floats(corpus: SimpleNamespace, topic: str, values: Any, shift: int = 0) -> list[Any]:
+def floats(topic: str, values: Any, shift: int = 0) -> list[Any]:
     return [
-        corpus.Sent(
+        Sent(
             topic,
             "std_msgs/msg/Float64",
-            corpus.START + k * STEP + shift,
-            corpus.serialized("std_msgs/msg/Float64", data=float(value)),
+            START + k * STEP + shift,
+            serialized("std_msgs/msg/Float64", data=float(value)),
         )
         for k, value in enumerate(values)
     ]
 
 
-def joint_states(
-    corpus: SimpleNamespace, names: Any, velocities: Any, frames: Any = None
-) -> list[Any]:
+def joint_states(names: Any, velocities: Any, frames: Any = None) -> list[Any]:
     """``names(k)`` are the joints of message k, ``velocities[k]`` their speeds."""
     sent = []
     for k, row in enumerate(velocities):
-        time = corpus.START + k * STEP
-        data = corpus.serialized(
+        time = START + k * STEP
+        data = serialized(
             "sensor_msgs/msg/JointState",
-            header=corpus.header(time, frames(k) if frames else ""),
+            header=header(time, frames(k) if frames else ""),
             name=names(k),
             position=np.zeros(0),
             velocity=np.array(row, float),
             effort=np.zeros(0),
         )
-        sent.append(corpus.Sent("/joint_states", "sensor_msgs/msg/JointState", time, data))
+        sent.append(Sent("/joint_states", "sensor_msgs/msg/JointState", time, data))
     return sent
 
 
@@ -57,18 +66,16 @@ MAP = ["voltage=/pwm.data*12/255", "velocity=/joint_states.velocity[left_wheel_j
 
 
 @pytest.mark.parametrize("storage", ["mcap", "db3"])
-def test_pwm_counts_and_the_joint_of_a_name(
-    tmp_path: Path, corpus: SimpleNamespace, storage: str
-) -> None:
+def test_pwm_counts_and_the_joint_of_a_name(tmp_path: Path, storage: str) -> None:
     n = 100
     rng = np.random.default_rng(0)
     pwm = rng.integers(-255, 256, n)
     speed = rng.normal(0, 1, (n, 2))
     messages = in_order(
-        floats(corpus, "/pwm", pwm),
-        joint_states(corpus, lambda _: ["right_wheel_joint", "left_wheel_joint"], speed),
+        floats("/pwm", pwm),
+        joint_states(lambda _: ["right_wheel_joint", "left_wheel_joint"], speed),
     )
-    write = corpus.write_mcap if storage == "mcap" else corpus.write_sqlite
+    write = write_mcap if storage == "mcap" else write_sqlite
     path = write(tmp_path / f"bag.{storage}", messages)
     record = read_records(path, MAP)["motor"]
     np.testing.assert_array_equal(record.velocity, speed[:, 1])
@@ -76,9 +83,7 @@ def test_pwm_counts_and_the_joint_of_a_name(
     np.testing.assert_allclose(record.voltage[1:], pwm[:-1] * 12 / 255, rtol=1e-15)
 
 
-def test_names_may_change_their_order_and_be_missing(
-    tmp_path: Path, corpus: SimpleNamespace
-) -> None:
+def test_names_may_change_their_order_and_be_missing(tmp_path: Path) -> None:
     n = 90
     rng = np.random.default_rng(1)
     pwm = rng.integers(-255, 256, n)
@@ -93,22 +98,19 @@ def test_names_may_change_their_order_and_be_missing(
     ]
     frames = ["", "a", "long frame"]
     messages = in_order(
-        floats(corpus, "/pwm", pwm),
-        joint_states(corpus, lambda k: orders[k % 3], rows, lambda k: frames[k % 2]),
+        floats("/pwm", pwm),
+        joint_states(lambda k: orders[k % 3], rows, lambda k: frames[k % 2]),
     )
-    record = read_records(corpus.write_mcap(tmp_path / "bag.mcap", messages), MAP)["motor"]
+    record = read_records(write_mcap(tmp_path / "bag.mcap", messages), MAP)["motor"]
     np.testing.assert_array_equal(record.velocity, left[np.arange(n) % 3 < 2])
 
 
-def test_a_topic_whose_every_message_is_laid_out_otherwise_is_read(
-    tmp_path: Path, corpus: SimpleNamespace
-) -> None:
+def test_a_topic_whose_every_message_is_laid_out_otherwise_is_read(tmp_path: Path) -> None:
     n = 150
     values = np.random.default_rng(2).normal(size=n)
     messages = in_order(
-        floats(corpus, "/pwm", values),
+        floats("/pwm", values),
         joint_states(
-            corpus,
             lambda k: [
                 *(f"joint{j}" for j in range(k % 7)),
                 f"n{k}" + "x" * (k % 23),
@@ -117,18 +119,18 @@ def test_a_topic_whose_every_message_is_laid_out_otherwise_is_read(
             [[0.0] * (k % 7 + 1) + [values[k]] for k in range(n)],
         ),
     )
-    record = read_records(corpus.write_mcap(tmp_path / "bag.mcap", messages), MAP)["motor"]
+    record = read_records(write_mcap(tmp_path / "bag.mcap", messages), MAP)["motor"]
     np.testing.assert_array_equal(record.velocity, values)
 
 
 @pytest.mark.parametrize("little", [True, False])
-def test_both_byte_orders_are_read(tmp_path: Path, corpus: SimpleNamespace, little: bool) -> None:
-    truth = corpus.motion()
+def test_both_byte_orders_are_read(tmp_path: Path, little: bool) -> None:
+    truth = motion()
     messages = [
-        corpus.Sent("/front_left/motor_state", corpus.STATE, int(t), truth.state(k, little))
+        Sent("/front_left/motor_state", STATE, int(t), truth.state(k, little))
         for k, t in enumerate(truth.time)
     ]
-    record = read_records(corpus.write_mcap(tmp_path / "bag.mcap", messages))["front_left"]
+    record = read_records(write_mcap(tmp_path / "bag.mcap", messages))["front_left"]
     np.testing.assert_array_equal(record.voltage, truth.voltage)
     np.testing.assert_array_equal(record.count, truth.count)
 
@@ -150,7 +152,7 @@ def nested_store() -> Any:
     return store
 
 
-def reports(corpus: SimpleNamespace, n: int) -> tuple[list[Any], np.ndarray]:
+def reports(n: int) -> tuple[list[Any], np.ndarray]:
     store = nested_store()
     values = np.random.default_rng(3).integers(-1000, 1000, (n, 2))
     sent = []
@@ -159,7 +161,7 @@ def reports(corpus: SimpleNamespace, n: int) -> tuple[list[Any], np.ndarray]:
             store.types["robot_msgs/msg/Wheel"](name, 1, float(values[k, j]), int(values[k, j]))
             for j, name in enumerate(("left", "right"))
         ]
-        time = corpus.START + k * STEP
+        time = START + k * STEP
         stamp = store.types["builtin_interfaces/msg/Time"](*divmod(time, 10**9))
         message = store.types["robot_msgs/msg/Report"](
             store.types["std_msgs/msg/Header"](stamp, "base"),
@@ -169,7 +171,7 @@ def reports(corpus: SimpleNamespace, n: int) -> tuple[list[Any], np.ndarray]:
             np.array([7, int(values[k, 0])], np.int16),
         )
         data = bytes(store.serialize_cdr(message, "robot_msgs/msg/Report"))
-        sent.append(corpus.Sent("/report", "robot_msgs/msg/Report", time, data))
+        sent.append(Sent("/report", "robot_msgs/msg/Report", time, data))
     return sent, values
 
 
@@ -180,9 +182,9 @@ REPORT_MAP = [
 ]
 
 
-def test_types_given_as_msg_files_are_used(tmp_path: Path, corpus: SimpleNamespace) -> None:
-    sent, values = reports(corpus, 60)
-    path = corpus.write_sqlite(tmp_path / "bag.db3", sent, schema=3)
+def test_types_given_as_msg_files_are_used(tmp_path: Path) -> None:
+    sent, values = reports(60)
+    path = write_sqlite(tmp_path / "bag.db3", sent, schema=3)
     with pytest.raises(BagError, match=r"robot_msgs/msg/Report.*unknown.*\.msg files") as refused:
         read_records(path, REPORT_MAP)
     assert "\n" not in str(refused.value)
@@ -207,8 +209,8 @@ def test_types_given_as_msg_files_are_used(tmp_path: Path, corpus: SimpleNamespa
     np.testing.assert_array_equal(record.count, values[:, 1])
 
 
-def test_types_defined_in_the_bag_are_used(tmp_path: Path, corpus: SimpleNamespace) -> None:
-    sent, values = reports(corpus, 60)
+def test_types_defined_in_the_bag_are_used(tmp_path: Path) -> None:
+    sent, values = reports(60)
     store = nested_store()
     text = store.generate_msgdef("robot_msgs/msg/Report", ros_version=2)[0]
     path = tmp_path / "bag.mcap"
@@ -228,18 +230,16 @@ def test_types_defined_in_the_bag_are_used(tmp_path: Path, corpus: SimpleNamespa
     assert {"wheels[0].speed", "wheels[1].ticks", "flags[2]", "raw[1]"} <= set(fields)
 
 
-def test_a_duty_cycle_times_the_supply_as_it_was_measured(
-    tmp_path: Path, corpus: SimpleNamespace
-) -> None:
+def test_a_duty_cycle_times_the_supply_as_it_was_measured(tmp_path: Path) -> None:
     n = 50
     duty = np.linspace(-1, 1, n)
     supply = np.linspace(12.6, 11.4, n)
     messages = in_order(
-        floats(corpus, "/duty", duty),
-        floats(corpus, "/battery", supply),
-        floats(corpus, "/speed", np.zeros(n)),
+        floats("/duty", duty),
+        floats("/battery", supply),
+        floats("/speed", np.zeros(n)),
     )
-    path = corpus.write_mcap(tmp_path / "bag.mcap", messages)
+    path = write_mcap(tmp_path / "bag.mcap", messages)
     mapping = ["voltage=/duty.data:duty supply=/battery.data velocity=/speed.data"]
     record = read_records(path, mapping)["motor"]
     np.testing.assert_allclose(record.voltage[1:], (duty * supply)[:-1], rtol=1e-12)
@@ -249,11 +249,9 @@ def test_a_duty_cycle_times_the_supply_as_it_was_measured(
         read_records(path, ["voltage=/duty.data:duty velocity=/speed.data"])
 
 
-def test_units_scales_and_shafts_come_out_in_si_at_the_motor(
-    tmp_path: Path, corpus: SimpleNamespace
-) -> None:
-    messages = in_order(floats(corpus, "/u", [1.0] * 9), floats(corpus, "/w", [60.0] * 9))
-    path = corpus.write_mcap(tmp_path / "bag.mcap", messages)
+def test_units_scales_and_shafts_come_out_in_si_at_the_motor(tmp_path: Path) -> None:
+    messages = in_order(floats("/u", [1.0] * 9), floats("/w", [60.0] * 9))
+    path = write_mcap(tmp_path / "bag.mcap", messages)
 
     def speed(spec: str) -> float:
         return float(read_records(path, f"voltage=/u.data {spec}")["motor"].velocity[0])
@@ -285,41 +283,37 @@ def test_units_scales_and_shafts_come_out_in_si_at_the_motor(
     ],
 )
 def test_a_mapping_that_does_not_fit_is_refused_with_the_available_fields(
-    tmp_path: Path, corpus: SimpleNamespace, mapping: str, reason: str
+    tmp_path: Path, mapping: str, reason: str
 ) -> None:
-    messages = in_order(floats(corpus, "/u", [1.0] * 9), floats(corpus, "/w", [60.0] * 9))
-    path = corpus.write_mcap(tmp_path / "bag.mcap", messages)
+    messages = in_order(floats("/u", [1.0] * 9), floats("/w", [60.0] * 9))
+    path = write_mcap(tmp_path / "bag.mcap", messages)
     with pytest.raises(BagError) as refused:
         read_records(path, mapping)
     assert reason in str(refused.value)
     assert "bag.mcap" in str(refused.value)
 
 
-def test_messages_that_are_not_of_their_type_are_left_out_and_told(
-    tmp_path: Path, corpus: SimpleNamespace
-) -> None:
-    truth = corpus.motion(n=100)
+def test_messages_that_are_not_of_their_type_are_left_out_and_told(tmp_path: Path) -> None:
+    truth = motion(n=100)
     messages = truth.messages()
-    messages[50] = corpus.Sent(
-        messages[50].topic, corpus.STATE, messages[50].stamp, b"\0\1\0\0rubbish"
-    )
-    messages[70] = corpus.Sent(messages[70].topic, corpus.STATE, messages[70].stamp, b"")
-    record = read_records(corpus.write_mcap(tmp_path / "bag.mcap", messages))["front_left"]
+    messages[50] = Sent(messages[50].topic, STATE, messages[50].stamp, b"\0\1\0\0rubbish")
+    messages[70] = Sent(messages[70].topic, STATE, messages[70].stamp, b"")
+    record = read_records(write_mcap(tmp_path / "bag.mcap", messages))["front_left"]
     assert len(record) == 98
     assert "2 messages are not of type smp_interfaces/msg/MotorState" in " ".join(
         f.message for f in record.findings
     )
 
 
-def test_the_topics_of_a_bag_are_listed(tmp_path: Path, corpus: SimpleNamespace) -> None:
+def test_the_topics_of_a_bag_are_listed(tmp_path: Path) -> None:
     n = 30
     messages = in_order(
-        floats(corpus, "/left/pwm", np.arange(n)),
-        floats(corpus, "/right/pwm", np.arange(n)),
-        floats(corpus, "/temperature", np.arange(n)),
-        joint_states(corpus, lambda _: ["left_wheel", "right_wheel"], [[1.0, 2.0]] * n),
+        floats("/left/pwm", np.arange(n)),
+        floats("/right/pwm", np.arange(n)),
+        floats("/temperature", np.arange(n)),
+        joint_states(lambda _: ["left_wheel", "right_wheel"], [[1.0, 2.0]] * n),
     )
-    path = corpus.write_mcap(tmp_path / "bag.mcap", messages)
+    path = write_mcap(tmp_path / "bag.mcap", messages)
     listing = list_topics(path)[0]
     assert listing.needs_mapping
     offers = {offer.topic: offer for offer in listing.offers}
@@ -329,22 +323,22 @@ def test_the_topics_of_a_bag_are_listed(tmp_path: Path, corpus: SimpleNamespace)
     assert listing.suggestion == []  # no speed follows these voltages
 
 
-def test_our_own_messages_need_no_mapping(tmp_path: Path, corpus: SimpleNamespace) -> None:
-    path = corpus.write_mcap(tmp_path / "bag.mcap", corpus.motion(n=20, bits=16).messages())
+def test_our_own_messages_need_no_mapping(tmp_path: Path) -> None:
+    path = write_mcap(tmp_path / "bag.mcap", motion(n=20, bits=16).messages())
     listing = list_topics(path)[0]
     assert not listing.needs_mapping
     assert listing.suggestion == []
     hardware = read_records(path)["front_left"].hardware
-    assert hardware.gear_ratio == corpus.RATIO
-    assert hardware.counts_per_revolution == corpus.COUNTS
+    assert hardware.gear_ratio == RATIO
+    assert hardware.counts_per_revolution == COUNTS
     assert (hardware.encoder_bits, hardware.supply_voltage, hardware.resistance) == (16, 12.0, None)
     given = read_records(path, ["gear_ratio=10", "resistance=1.5"])["front_left"].hardware
     assert (given.gear_ratio, given.resistance, given.encoder_bits) == (10.0, 1.5, 16)
 
 
-def test_a_missing_description_is_told(tmp_path: Path, corpus: SimpleNamespace) -> None:
-    messages = corpus.motion(n=20).messages(description=False)
-    record = read_records(corpus.write_mcap(tmp_path / "bag.mcap", messages))["front_left"]
+def test_a_missing_description_is_told(tmp_path: Path) -> None:
+    messages = motion(n=20).messages(description=False)
+    record = read_records(write_mcap(tmp_path / "bag.mcap", messages))["front_left"]
     assert "no motor_description; a gear ratio of 1 is assumed" in " ".join(
         f.message for f in record.findings
     )

@@ -5,13 +5,24 @@ from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
+from recordings import (
+    START,
+    Motion,
+    Sent,
+    assert_read,
+    header,
+    motion,
+    read,
+    serialized,
+    write_mcap,
+    write_sqlite,
+)
 
 from smp_motor_ident.bag import BagWriter, join_records, read_records
 from smp_motor_ident.bag.clock import average_held_input, fit_clock
@@ -33,7 +44,7 @@ def replaced(truth: Any, **changes: Any) -> Any:
 @MANY
 @given(data=st.data())
 def test_any_sequence_of_states_reads_back_as_it_was_written(
-    tmp_path_factory: pytest.TempPathFactory, corpus: SimpleNamespace, data: st.DataObject
+    tmp_path_factory: pytest.TempPathFactory, data: st.DataObject
 ) -> None:
     n = data.draw(st.integers(2, 60))
     finite = st.floats(-1e12, 1e12)
@@ -41,9 +52,9 @@ def test_any_sequence_of_states_reads_back_as_it_was_written(
     # Any intervals between half and one and a half of each other: no gap, no loss.
     steps = data.draw(st.lists(st.integers(8_000_000, 12_000_000), min_size=n, max_size=n))
     counts = data.draw(st.lists(st.integers(-(2**62), 2**62), min_size=n, max_size=n))
-    truth = corpus.Motion(
+    truth = Motion(
         "rear_right",
-        corpus.START + np.cumsum(np.array(steps, np.int64)),
+        START + np.cumsum(np.array(steps, np.int64)),
         *(data.draw(column) for _ in range(4)),
         count=np.array(counts, np.int64),
     )
@@ -51,53 +62,50 @@ def test_any_sequence_of_states_reads_back_as_it_was_written(
     with BagWriter(bag) as writer:
         for sent in truth.messages():
             writer.write(sent.topic, sent.type, sent.data, sent.stamp)
-    corpus.assert_read(read_records(bag)["rear_right"], truth)
+    assert_read(read_records(bag)["rear_right"], truth)
 
 
 @MANY
 @given(order=st.permutations(range(50)), storage=st.sampled_from(["mcap", "db3"]))
 def test_shuffled_samples_are_sorted_and_that_is_told(
     tmp_path_factory: pytest.TempPathFactory,
-    corpus: SimpleNamespace,
     order: list[int],
     storage: str,
 ) -> None:
-    truth = corpus.motion(n=50)
+    truth = motion(n=50)
     messages = truth.messages(description=False)
     description = truth.messages()[:1]
     path = tmp_path_factory.mktemp("bag") / f"bag.{storage}"
-    write = corpus.write_mcap if storage == "mcap" else corpus.write_sqlite
+    write = write_mcap if storage == "mcap" else write_sqlite
     write(path, [*description, *(messages[k] for k in order)])
     record = read_records(path)["front_left"]
-    corpus.assert_read(record, truth)
+    assert_read(record, truth)
     shuffled = list(order) != sorted(order)
     assert ("out of order" in " ".join(f.message for f in record.findings)) is shuffled
 
 
 def test_a_mean_voltage_over_a_long_interval_of_irregular_samples_begins_a_segment(
-    tmp_path: Path, corpus: SimpleNamespace
+    tmp_path: Path,
 ) -> None:
     """The mean does not tell when within 0.4 s, where 10 ms are usual, the voltage changed."""
-    truth = corpus.motion(n=200)
+    truth = motion(n=200)
     steps = np.where(np.arange(200) % 3, 10_000_000, 19_000_000)
     steps[120] = 400_000_000
-    truth = replaced(truth, time=corpus.START + np.cumsum(steps))
-    record = corpus.read(tmp_path / "bag.mcap", truth.messages())
+    truth = replaced(truth, time=START + np.cumsum(steps))
+    record = read(tmp_path / "bag.mcap", truth.messages())
     assert record.starts == (0, 120)
     assert "1 gaps of up to 0.4 s" in " ".join(f.message for f in record.findings)
 
 
-def test_a_few_lost_samples_are_bridged_and_more_begin_a_segment(
-    tmp_path: Path, corpus: SimpleNamespace
-) -> None:
-    truth = corpus.motion(n=400)
+def test_a_few_lost_samples_are_bridged_and_more_begin_a_segment(tmp_path: Path) -> None:
+    truth = motion(n=400)
     ramp = np.linspace(-10, 10, 400)
     truth = replaced(truth, voltage=ramp)
     lost = [50, 100, 101, *range(200, 205), *range(300, 350)]
     kept = np.setdiff1d(np.arange(400), lost)
     messages = truth.messages()
     some = [messages[0], *(messages[1 + k] for k in kept)]
-    record = corpus.read(tmp_path / "bag.mcap", some)
+    record = read(tmp_path / "bag.mcap", some)
     assert len(record) == kept.size
     assert [int(kept[s]) for s in record.starts] == [0, 205, 350]
     notes = " ".join(f.message for f in record.findings)
@@ -112,39 +120,37 @@ def test_a_few_lost_samples_are_bridged_and_more_begin_a_segment(
     np.testing.assert_array_equal(record.voltage[untouched], ramp[kept][untouched])
 
 
-def test_late_samples_are_not_taken_for_lost_ones(tmp_path: Path, corpus: SimpleNamespace) -> None:
-    truth = corpus.motion(n=400)
+def test_late_samples_are_not_taken_for_lost_ones(tmp_path: Path) -> None:
+    truth = motion(n=400)
     time = truth.time.copy()
     # A stall of four periods, after which the sampler catches up in a burst.
     for k in (60, 200, 330):
         time[k : k + 4] = time[k + 3] + np.arange(4) * 100_000
     truth = replaced(truth, time=time)
-    record = corpus.read(tmp_path / "bag.mcap", truth.messages())
-    corpus.assert_read(record, truth)
+    record = read(tmp_path / "bag.mcap", truth.messages())
+    assert_read(record, truth)
     assert record.starts == (0,)
     assert "missing" not in " ".join(f.message for f in record.findings)
 
 
-def test_duplicates_are_left_out_and_told(tmp_path: Path, corpus: SimpleNamespace) -> None:
-    truth = corpus.motion(n=100)
+def test_duplicates_are_left_out_and_told(tmp_path: Path) -> None:
+    truth = motion(n=100)
     messages = truth.messages()
-    record = corpus.read(tmp_path / "bag.mcap", [*messages, *messages[40:60]])
-    corpus.assert_read(record, truth)
+    record = read(tmp_path / "bag.mcap", [*messages, *messages[40:60]])
+    assert_read(record, truth)
     assert "20 samples with a repeated time were left out (duplicates)" in " ".join(
         [f.message for f in record.findings]
     )
 
 
-def test_samples_without_a_voltage_are_left_out_and_told(
-    tmp_path: Path, corpus: SimpleNamespace
-) -> None:
-    truth = corpus.motion(n=100)
+def test_samples_without_a_voltage_are_left_out_and_told(tmp_path: Path) -> None:
+    truth = motion(n=100)
     voltage, current = truth.voltage.copy(), np.full(100, np.nan)
     voltage[[10, 40]] = np.nan, np.inf
     velocity = truth.velocity.copy()
     velocity[70] = np.nan
     truth = replaced(truth, voltage=voltage, current=current, velocity=velocity)
-    record = corpus.read(tmp_path / "bag.mcap", truth.messages())
+    record = read(tmp_path / "bag.mcap", truth.messages())
     assert len(record) == 98
     assert record.current is None
     assert np.isnan(record.velocity).sum() == 1
@@ -155,57 +161,52 @@ def test_samples_without_a_voltage_are_left_out_and_told(
 
 @pytest.mark.parametrize("days", [0, 3, -3])
 def test_header_stamps_days_away_from_the_log_are_used_and_that_is_told(
-    tmp_path: Path, corpus: SimpleNamespace, days: int
+    tmp_path: Path, days: int
 ) -> None:
-    truth = corpus.motion(n=100)
-    record = corpus.read(tmp_path / "bag.mcap", truth.messages(latency=days * 86_400 * 10**9 + 7))
-    corpus.assert_read(record, truth)
+    truth = motion(n=100)
+    record = read(tmp_path / "bag.mcap", truth.messages(latency=days * 86_400 * 10**9 + 7))
+    assert_read(record, truth)
     notes = " ".join(f.message for f in record.findings)
     assert "time: header stamps" in notes
     assert (f"{days * 86400:+d}.000000 s from the header's" in notes) is bool(days)
 
 
-def test_stamps_that_are_not_set_are_not_the_time(tmp_path: Path, corpus: SimpleNamespace) -> None:
-    truth = corpus.motion(n=100)
+def test_stamps_that_are_not_set_are_not_the_time(tmp_path: Path) -> None:
+    truth = motion(n=100)
     unset = replaced(truth, time=np.zeros(100, np.int64))
     messages = [
         dataclasses.replace(sent, stamp=int(truth.time[k]))
         for k, sent in enumerate(unset.messages(description=False))
     ]
-    record = corpus.read(tmp_path / "bag.mcap", [*truth.messages()[:1], *messages])
-    corpus.assert_read(record, truth)
+    record = read(tmp_path / "bag.mcap", [*truth.messages()[:1], *messages])
+    assert_read(record, truth)
     assert "time: log times (the header stamps are not set)" in " ".join(
         f.message for f in record.findings
     )
 
 
-def test_a_clock_that_was_set_back_begins_a_new_segment(
-    tmp_path: Path, corpus: SimpleNamespace
-) -> None:
-    truth = corpus.motion(n=200)
+def test_a_clock_that_was_set_back_begins_a_new_segment(tmp_path: Path) -> None:
+    truth = motion(n=200)
     stamps = truth.time.copy()
     stamps[100:] -= 3_600 * 10**9
     messages = [
         dataclasses.replace(sent, stamp=int(truth.time[k]))
         for k, sent in enumerate(replaced(truth, time=stamps).messages(description=False))
     ]
-    record = corpus.read(tmp_path / "bag.mcap", [*truth.messages()[:1], *messages])
+    record = read(tmp_path / "bag.mcap", [*truth.messages()[:1], *messages])
     assert record.starts == (0, 100)
     np.testing.assert_array_equal(record.voltage, truth.voltage)
     assert "set back 1 times" in " ".join(f.message for f in record.findings)
 
 
-def floats(corpus: SimpleNamespace, topic: str, times: Any, values: Any) -> list[Any]:
+def floats(topic: str, times: Any, values: Any) -> list[Any]:
     kind = "std_msgs/msg/Float64"
     return [
-        corpus.Sent(topic, kind, int(t), corpus.serialized(kind, data=float(v)))
-        for t, v in zip(times, values)
+        Sent(topic, kind, int(t), serialized(kind, data=float(v))) for t, v in zip(times, values)
     ]
 
 
-def test_a_stamped_output_meets_an_unstamped_input_by_offset_and_drift(
-    tmp_path: Path, corpus: SimpleNamespace
-) -> None:
+def test_a_stamped_output_meets_an_unstamped_input_by_offset_and_drift(tmp_path: Path) -> None:
     rng = np.random.default_rng(5)
     n, drift, offset = 3000, 50e-6, 12_345.678
     sampled = np.arange(n) * 0.01  # the microcontroller's clock
@@ -213,23 +214,21 @@ def test_a_stamped_output_meets_an_unstamped_input_by_offset_and_drift(
     latency = 0.0002 + rng.exponential(0.0005, n)
     messages = []
     for k in range(n):
-        data = corpus.serialized(
+        data = serialized(
             "sensor_msgs/msg/JointState",
-            header=corpus.header(corpus.START + round(sampled[k] * 1e9), ""),
+            header=header(START + round(sampled[k] * 1e9), ""),
             name=["w"],
             position=np.zeros(0),
             velocity=np.array([on_log[k]]),
             effort=np.zeros(0),
         )
-        stamp = corpus.START + round((on_log[k] + latency[k]) * 1e9)
-        messages.append(corpus.Sent("/js", "sensor_msgs/msg/JointState", stamp, data))
+        stamp = START + round((on_log[k] + latency[k]) * 1e9)
+        messages.append(Sent("/js", "sensor_msgs/msg/JointState", stamp, data))
     # The input is its own time, so that an error of alignment is an error of voltage.
     input_times = np.arange(n // 2) * 0.02 + offset
-    stamps = corpus.START + np.rint(input_times * 1e9).astype(np.int64)
-    messages = sorted(messages + floats(corpus, "/u", stamps, input_times), key=lambda s: s.stamp)
-    record = corpus.read(
-        tmp_path / "bag.mcap", messages, "voltage=/u.data velocity=/js.velocity[w]"
-    )
+    stamps = START + np.rint(input_times * 1e9).astype(np.int64)
+    messages = sorted(messages + floats("/u", stamps, input_times), key=lambda s: s.stamp)
+    record = read(tmp_path / "bag.mcap", messages, "voltage=/u.data velocity=/js.velocity[w]")
     notes = " ".join(f.message for f in record.findings)
     assert "offset and drift" in notes
     assert "drifting by +50 ppm" in notes
@@ -274,46 +273,42 @@ def test_a_held_input_is_averaged_over_each_interval(data: st.DataObject, held: 
         assert found[k] == pytest.approx(level[inside].mean(), abs=1e-9)
 
 
-def test_samples_before_the_first_command_are_left_out(
-    tmp_path: Path, corpus: SimpleNamespace
-) -> None:
-    times = corpus.START + np.arange(100) * 10_000_000
+def test_samples_before_the_first_command_are_left_out(tmp_path: Path) -> None:
+    times = START + np.arange(100) * 10_000_000
     messages = sorted(
-        floats(corpus, "/w", times, np.arange(100)) + floats(corpus, "/u", times[30:], np.ones(70)),
+        floats("/w", times, np.arange(100)) + floats("/u", times[30:], np.ones(70)),
         key=lambda sent: sent.stamp,
     )
-    record = corpus.read(tmp_path / "bag.mcap", messages, "voltage=/u.data velocity=/w.data")
+    record = read(tmp_path / "bag.mcap", messages, "voltage=/u.data velocity=/w.data")
     assert len(record) == 70
     assert "30 samples before the first voltage were left out" in " ".join(
         f.message for f in record.findings
     )
 
 
-def test_an_input_that_stops_ends_the_record_there(tmp_path: Path, corpus: SimpleNamespace) -> None:
-    times = corpus.START + np.arange(200) * 10_000_000
+def test_an_input_that_stops_ends_the_record_there(tmp_path: Path) -> None:
+    times = START + np.arange(200) * 10_000_000
     on = np.r_[0:60, 140:200]
     messages = sorted(
-        floats(corpus, "/w", times, np.arange(200)) + floats(corpus, "/u", times[on], np.ones(120)),
+        floats("/w", times, np.arange(200)) + floats("/u", times[on], np.ones(120)),
         key=lambda sent: sent.stamp,
     )
-    record = corpus.read(tmp_path / "bag.mcap", messages, "voltage=/u.data velocity=/w.data")
+    record = read(tmp_path / "bag.mcap", messages, "voltage=/u.data velocity=/w.data")
     notes = " ".join(f.message for f in record.findings)
     assert "no voltage came for more than 0.2 s" in notes
     assert len(record.starts) == 2
 
 
-def test_outputs_of_several_topics_come_onto_one_axis(
-    tmp_path: Path, corpus: SimpleNamespace
-) -> None:
-    fast = corpus.START + np.arange(400) * 5_000_000
-    slow = corpus.START + np.arange(200) * 10_000_000 + 1_000_000
+def test_outputs_of_several_topics_come_onto_one_axis(tmp_path: Path) -> None:
+    fast = START + np.arange(400) * 5_000_000
+    slow = START + np.arange(200) * 10_000_000 + 1_000_000
     messages = sorted(
-        floats(corpus, "/u", slow, np.ones(200))
-        + floats(corpus, "/pos", slow, np.arange(200) * 0.01)
-        + floats(corpus, "/w", fast, np.arange(400) * 0.5),
+        floats("/u", slow, np.ones(200))
+        + floats("/pos", slow, np.arange(200) * 0.01)
+        + floats("/w", fast, np.arange(400) * 0.5),
         key=lambda sent: sent.stamp,
     )
-    record = corpus.read(
+    record = read(
         tmp_path / "bag.mcap",
         messages,
         "voltage=/u.data position=/pos.data velocity=/w.data",
@@ -324,26 +319,20 @@ def test_outputs_of_several_topics_come_onto_one_axis(
     assert "velocity: interpolated" in " ".join(f.message for f in record.findings)
 
 
-def test_an_angle_that_wraps_at_a_turn_is_unwrapped(
-    tmp_path: Path, corpus: SimpleNamespace
-) -> None:
-    times = corpus.START + np.arange(300) * 10_000_000
+def test_an_angle_that_wraps_at_a_turn_is_unwrapped(tmp_path: Path) -> None:
+    times = START + np.arange(300) * 10_000_000
     angle = np.arange(300) * 7.0
     messages = sorted(
-        floats(corpus, "/u", times, np.ones(300)) + floats(corpus, "/angle", times, angle % 360),
+        floats("/u", times, np.ones(300)) + floats("/angle", times, angle % 360),
         key=lambda sent: sent.stamp,
     )
-    record = corpus.read(
-        tmp_path / "bag.mcap", messages, "voltage=/u.data position=/angle.data:deg"
-    )
+    record = read(tmp_path / "bag.mcap", messages, "voltage=/u.data position=/angle.data:deg")
     np.testing.assert_allclose(np.diff(record.position), np.deg2rad(7.0), rtol=1e-9)
     assert "wraps at one turn" in " ".join(f.message for f in record.findings)
 
 
-def test_recordings_of_different_gearboxes_are_not_joined(
-    tmp_path: Path, corpus: SimpleNamespace
-) -> None:
-    record = corpus.read(tmp_path / "bag.mcap", corpus.motion(n=20).messages())
+def test_recordings_of_different_gearboxes_are_not_joined(tmp_path: Path) -> None:
+    record = read(tmp_path / "bag.mcap", motion(n=20).messages())
     other = dataclasses.replace(
         record, hardware=dataclasses.replace(record.hardware, gear_ratio=1.0)
     )
@@ -351,10 +340,8 @@ def test_recordings_of_different_gearboxes_are_not_joined(
         join_records([record, other])
 
 
-def test_signals_of_only_some_recordings_are_kept_there(
-    tmp_path: Path, corpus: SimpleNamespace
-) -> None:
-    record = corpus.read(tmp_path / "bag.mcap", corpus.motion(n=20).messages())
+def test_signals_of_only_some_recordings_are_kept_there(tmp_path: Path) -> None:
+    record = read(tmp_path / "bag.mcap", motion(n=20).messages())
     other = dataclasses.replace(record, current=None)
     joined = join_records([record, other])
     np.testing.assert_array_equal(joined.current[:20], record.current)
@@ -362,27 +349,25 @@ def test_signals_of_only_some_recordings_are_kept_there(
     assert np.all(np.diff(joined.time) > 0)
 
 
-def test_a_recording_knows_when_it_began_where_its_clock_was_set(
-    tmp_path: Path, corpus: SimpleNamespace
-) -> None:
-    truth = corpus.motion()
-    (record,) = read_records(corpus.write_mcap(tmp_path / "a.mcap", truth.messages())).values()
-    assert record.recorded == pytest.approx(1e-9 * corpus.START, abs=1.0)
+def test_a_recording_knows_when_it_began_where_its_clock_was_set(tmp_path: Path) -> None:
+    truth = motion()
+    (record,) = read_records(write_mcap(tmp_path / "a.mcap", truth.messages())).values()
+    assert record.recorded == pytest.approx(1e-9 * START, abs=1.0)
     # A computer without a clock battery starts at 1970, which is not a date.
-    early = replaced(truth, time=truth.time - corpus.START)
-    (record,) = read_records(corpus.write_mcap(tmp_path / "b.mcap", early.messages())).values()
+    early = replaced(truth, time=truth.time - START)
+    (record,) = read_records(write_mcap(tmp_path / "b.mcap", early.messages())).values()
     assert record.recorded is None
 
 
 @pytest.mark.parametrize("years", [0.01, 1.0, 56.0])
 def test_a_clock_that_is_set_forward_begins_a_segment_and_costs_no_time(
-    tmp_path: Path, corpus: SimpleNamespace, years: float
+    tmp_path: Path, years: float
 ) -> None:
-    truth = corpus.motion(n=400)
+    truth = motion(n=400)
     leap = round(years * 365.25 * 86_400) * 10**9
-    time = truth.time - corpus.START
+    time = truth.time - START
     truth = replaced(truth, time=time + leap * (np.arange(400) >= 250) + 10**9)
-    record = corpus.read(tmp_path / "bag.mcap", truth.messages())
+    record = read(tmp_path / "bag.mcap", truth.messages())
     assert record.starts == (0, 250)
     assert record.duration < 20.0
     np.testing.assert_allclose(np.diff(record.time)[[248, 250]], 0.01, rtol=1e-9)
@@ -390,16 +375,14 @@ def test_a_clock_that_is_set_forward_begins_a_segment_and_costs_no_time(
     assert found.evidence["longest"] == pytest.approx(leap * 1e-9, rel=1e-6)
 
 
-def test_offsets_between_topics_are_kept_where_the_clock_is_set(
-    tmp_path: Path, corpus: SimpleNamespace
-) -> None:
+def test_offsets_between_topics_are_kept_where_the_clock_is_set(tmp_path: Path) -> None:
     number, leap = "std_msgs/msg/Float64", 10**18
     sent = [
-        corpus.Sent(topic, number, at, corpus.serialized(number, data=float(value)))
+        Sent(topic, number, at, serialized(number, data=float(value)))
         for k in range(400)
-        for at in [corpus.START + 10**7 * k + leap * (k >= 200)]
+        for at in [START + 10**7 * k + leap * (k >= 200)]
         for topic, value in (("/u", k // 20 % 3), ("/w", np.sin(0.1 * k)))
     ]
-    record = corpus.read(tmp_path / "bag.mcap", sent, ["voltage=/u.data velocity=/w.data"])
+    record = read(tmp_path / "bag.mcap", sent, ["voltage=/u.data velocity=/w.data"])
     assert record.starts == (0, 200)
     np.testing.assert_allclose(record.velocity, np.sin(0.1 * np.arange(400)))

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from recordings import Sent, header, merged, motion, serialized, write_mcap
 
 from smp_motor_ident.bag.transport import measure_delay
 from smp_motor_ident.cli.tune import main as tune
@@ -22,12 +23,10 @@ FINE = 10_000
 """Grid on which the applied voltage is put together [ns]."""
 
 
-def driven_bag(
-    corpus, path: Path, arrival: np.ndarray, *, latch: bool, answering: bool = True
-) -> Path:
+def driven_bag(path: Path, arrival: np.ndarray, *, latch: bool, answering: bool = True) -> Path:
     """Write the bag of a loop whose command ``k`` arrives ``arrival[k]`` ns after sample ``k``."""
     rng = np.random.default_rng(7)
-    one = corpus.motion(arrival.size, step=PERIOD)
+    one = motion(arrival.size, step=PERIOD)
     wanted = rng.uniform(-6, 6, arrival.size)
     begin = one.time[0]
     acts = np.arange(arrival.size) * PERIOD + arrival
@@ -37,14 +36,14 @@ def driven_bag(
     for k in np.argsort(acts, kind="stable"):
         volts[acts[k] // FINE :] = wanted[k]
     applied = np.roll(volts.reshape(arrival.size, -1).mean(axis=1), 1)
-    sent = corpus.merged(replace(one, voltage=applied), latency=150_000)
+    sent = merged(replace(one, voltage=applied), latency=150_000)
     for k, late in enumerate(arrival):
         stamp = one.time[k] if answering else one.time[k] + 1_234_567
-        data = corpus.serialized(COMMAND, header=corpus.header(stamp), voltage=float(wanted[k]))
+        data = serialized(COMMAND, header=header(stamp), voltage=float(wanted[k]))
         sent.append(
-            corpus.Sent("/front_left/motor_command", COMMAND, int(begin + k * PERIOD + late), data)
+            Sent("/front_left/motor_command", COMMAND, int(begin + k * PERIOD + late), data)
         )
-    return corpus.write_mcap(path, sorted(sent, key=lambda s: s.stamp))
+    return write_mcap(path, sorted(sent, key=lambda s: s.stamp))
 
 
 def arrivals(n: int = 600) -> np.ndarray:
@@ -53,11 +52,9 @@ def arrivals(n: int = 600) -> np.ndarray:
     return (late / FINE).astype(np.int64) * FINE
 
 
-def test_driver_that_applies_on_arrival_tells_its_delay(tmp_path, corpus):
+def test_driver_that_applies_on_arrival_tells_its_delay(tmp_path):
     arrival = arrivals()
-    found = measure_delay(driven_bag(corpus, tmp_path / "a.mcap", arrival, latch=False))[
-        "front_left"
-    ]
+    found = measure_delay(driven_bag(tmp_path / "a.mcap", arrival, latch=False))["front_left"]
     assert not found.latched
     assert found.answers == 600
     # One delay for all, within the spread of the tail and one trial step (0.25 ms).
@@ -66,33 +63,29 @@ def test_driver_that_applies_on_arrival_tells_its_delay(tmp_path, corpus):
     assert found.until_applied(0.002) == (found.usual, found.longest)
 
 
-def test_driver_that_waits_for_its_next_sample_is_recognised(tmp_path, corpus):
-    found = measure_delay(driven_bag(corpus, tmp_path / "a.mcap", arrivals(), latch=True))[
-        "front_left"
-    ]
+def test_driver_that_waits_for_its_next_sample_is_recognised(tmp_path):
+    found = measure_delay(driven_bag(tmp_path / "a.mcap", arrivals(), latch=True))["front_left"]
     assert found.latched
     assert found.until_applied(0.005) == (0.005, 0.005)
     # At a rate at which the tail misses the next sample it is two.
     assert found.until_applied(0.0018) == (0.0018, 0.0036)
 
 
-def test_few_late_commands_do_not_set_the_delay(tmp_path, corpus):
+def test_few_late_commands_do_not_set_the_delay(tmp_path):
     arrival = arrivals()
     arrival[200:220] += 200_000_000  # the machine stood still for a tenth of a second
-    found = measure_delay(driven_bag(corpus, tmp_path / "a.mcap", arrival, latch=False))[
-        "front_left"
-    ]
+    found = measure_delay(driven_bag(tmp_path / "a.mcap", arrival, latch=False))["front_left"]
     assert found.longest < 0.005
 
 
-def test_bag_whose_commands_answer_nothing_is_refused(tmp_path, corpus):
-    bag = driven_bag(corpus, tmp_path / "a.mcap", arrivals(), latch=False, answering=False)
+def test_bag_whose_commands_answer_nothing_is_refused(tmp_path):
+    bag = driven_bag(tmp_path / "a.mcap", arrivals(), latch=False, answering=False)
     with pytest.raises(BagError, match="no wheel with 50 motor_command that answer"):
         measure_delay(bag)
 
 
-def test_tune_designs_for_the_delay_of_a_bag_and_reports_it(tmp_path, corpus, capsys):
-    bag = driven_bag(corpus, tmp_path / "a.mcap", arrivals() + 6_000_000, latch=False)
+def test_tune_designs_for_the_delay_of_a_bag_and_reports_it(tmp_path, capsys):
+    bag = driven_bag(tmp_path / "a.mcap", arrivals() + 6_000_000, latch=False)
     output = tmp_path / "gains.yaml"
     assert tune([str(MOTORS), "--bag", str(bag), "--output", str(output)]) == 0
     loops = json.loads((tmp_path / "gains.json").read_text())["wheels"]

@@ -6,13 +6,13 @@ from __future__ import annotations
 import random
 import sqlite3
 from pathlib import Path
-from types import SimpleNamespace
 
 import lz4.frame
 import mcap.writer
 import numpy as np
 import pytest
 from backports import zstd
+from recordings import assert_read, motion, write_mcap, write_metadata, write_sqlite
 
 from smp_motor_ident.bag import BagWriter, read_records
 from smp_motor_ident.errors import BagError
@@ -63,24 +63,22 @@ def assert_every_cut_is_sound(whole: bytes, path: Path, samples: int, most_lost:
     ],
 )
 def test_an_mcap_file_cut_at_every_kilobyte(
-    tmp_path: Path, corpus: SimpleNamespace, options: dict[str, object], most_lost: int
+    tmp_path: Path, options: dict[str, object], most_lost: int
 ) -> None:
-    truth = corpus.motion(n=400)
-    path = corpus.write_mcap(tmp_path / "bag.mcap", truth.messages(), **options)
+    truth = motion(n=400)
+    path = write_mcap(tmp_path / "bag.mcap", truth.messages(), **options)
     assert_every_cut_is_sound(path.read_bytes(), path, 400, most_lost)
 
 
-def test_a_sqlite_file_cut_at_every_kilobyte(tmp_path: Path, corpus: SimpleNamespace) -> None:
-    truth = corpus.motion(n=400)
-    path = corpus.write_sqlite(tmp_path / "bag.db3", truth.messages())
+def test_a_sqlite_file_cut_at_every_kilobyte(tmp_path: Path) -> None:
+    truth = motion(n=400)
+    path = write_sqlite(tmp_path / "bag.db3", truth.messages())
     # The first seven of its twenty pages hold no messages: by the bytes, those of 140.
     assert_every_cut_is_sound(path.read_bytes(), path, 400, 140)
 
 
-def test_rows_that_are_out_of_order_are_not_read_for_ever(
-    tmp_path: Path, corpus: SimpleNamespace
-) -> None:
-    path = corpus.write_sqlite(tmp_path / "bag.db3", corpus.motion(n=400).messages())
+def test_rows_that_are_out_of_order_are_not_read_for_ever(tmp_path: Path) -> None:
+    path = write_sqlite(tmp_path / "bag.db3", motion(n=400).messages())
     database = sqlite3.connect(path)
     last = max(database.execute("SELECT max(id) FROM messages").fetchone())
     database.execute("UPDATE messages SET data = '' WHERE id = ?", (last,))  # no message
@@ -99,10 +97,10 @@ def test_rows_that_are_out_of_order_are_not_read_for_ever(
 @pytest.mark.parametrize("pack", [zstd.compress, lz4.frame.compress])
 @pytest.mark.parametrize("storage", ["mcap", "db3"])
 def test_a_compressed_file_cut_at_every_kilobyte(
-    tmp_path: Path, corpus: SimpleNamespace, storage: str, pack: object
+    tmp_path: Path, storage: str, pack: object
 ) -> None:
-    truth = corpus.motion(n=400)
-    write = corpus.write_mcap if storage == "mcap" else corpus.write_sqlite
+    truth = motion(n=400)
+    write = write_mcap if storage == "mcap" else write_sqlite
     plain = write(tmp_path / f"bag.{storage}", truth.messages())
     assert callable(pack)
     path = tmp_path / f"bag.{storage}.packed"
@@ -110,24 +108,22 @@ def test_a_compressed_file_cut_at_every_kilobyte(
     assert_every_cut_is_sound(pack(plain.read_bytes()), path, 400, 400)
 
 
-def test_a_cut_bag_reports_its_share_of_the_declared_messages(
-    tmp_path: Path, corpus: SimpleNamespace
-) -> None:
-    truth = corpus.motion(n=400)
+def test_a_cut_bag_reports_its_share_of_the_declared_messages(tmp_path: Path) -> None:
+    truth = motion(n=400)
     bag = tmp_path / "bag"
     bag.mkdir()
-    path = corpus.write_mcap(bag / "bag_0.mcap", truth.messages())
-    corpus.write_metadata(bag, ["bag_0.mcap"], truth.messages())
+    path = write_mcap(bag / "bag_0.mcap", truth.messages())
+    write_metadata(bag, ["bag_0.mcap"], truth.messages())
     path.write_bytes(path.read_bytes()[:20_000])
     count, words = samples_and_words(bag)
     assert 0 < count < 400
     assert f"{count} of 400 messages could be read" in words
-    corpus.assert_read(read_records(bag)["front_left"], truth, count)
+    assert_read(read_records(bag)["front_left"], truth, count)
 
 
-def test_a_damaged_chunk_costs_only_itself(tmp_path: Path, corpus: SimpleNamespace) -> None:
-    truth = corpus.motion(n=400)
-    path = corpus.write_mcap(tmp_path / "bag.mcap", truth.messages())
+def test_a_damaged_chunk_costs_only_itself(tmp_path: Path) -> None:
+    truth = motion(n=400)
+    path = write_mcap(tmp_path / "bag.mcap", truth.messages())
     data = bytearray(path.read_bytes())
     data[20_000] ^= 0xFF
     path.write_bytes(data)
@@ -138,10 +134,10 @@ def test_a_damaged_chunk_costs_only_itself(tmp_path: Path, corpus: SimpleNamespa
     assert f"{count} of 400 messages" in words
 
 
-def test_random_damage_never_ends_in_a_traceback(tmp_path: Path, corpus: SimpleNamespace) -> None:
-    truth = corpus.motion(n=60)
+def test_random_damage_never_ends_in_a_traceback(tmp_path: Path) -> None:
+    truth = motion(n=60)
     chance = random.Random(4)
-    for storage, write in (("mcap", corpus.write_mcap), ("db3", corpus.write_sqlite)):
+    for storage, write in (("mcap", write_mcap), ("db3", write_sqlite)):
         path = write(tmp_path / f"bag.{storage}", truth.messages())
         whole = path.read_bytes()
         for _ in range(60):
@@ -152,9 +148,9 @@ def test_random_damage_never_ends_in_a_traceback(tmp_path: Path, corpus: SimpleN
             samples_and_words(path)
 
 
-def test_a_tail_of_zeros_is_not_a_message(tmp_path: Path, corpus: SimpleNamespace) -> None:
-    truth = corpus.motion(n=400)
-    path = corpus.write_mcap(tmp_path / "bag.mcap", truth.messages(), use_chunking=False)
+def test_a_tail_of_zeros_is_not_a_message(tmp_path: Path) -> None:
+    truth = motion(n=400)
+    path = write_mcap(tmp_path / "bag.mcap", truth.messages(), use_chunking=False)
     data = path.read_bytes()
     path.write_bytes(data[:30_000] + bytes(len(data) - 30_000))
     count, words = samples_and_words(path)
@@ -165,12 +161,10 @@ def test_a_tail_of_zeros_is_not_a_message(tmp_path: Path, corpus: SimpleNamespac
     np.testing.assert_array_equal(record.voltage[:-1], truth.voltage[: count - 1])
 
 
-def test_a_writer_that_was_killed_leaves_a_bag_that_everybody_reads(
-    tmp_path: Path, corpus: SimpleNamespace
-) -> None:
+def test_a_writer_that_was_killed_leaves_a_bag_that_everybody_reads(tmp_path: Path) -> None:
     from rosbags.highlevel import AnyReader
 
-    truth = corpus.motion(n=300)
+    truth = motion(n=300)
     bag = BagWriter(tmp_path / "bag")
     for sent in truth.messages():
         bag.write(sent.topic, sent.type, sent.data, sent.stamp)
@@ -179,5 +173,5 @@ def test_a_writer_that_was_killed_leaves_a_bag_that_everybody_reads(
     with AnyReader([tmp_path / "bag"]) as reader:
         assert sum(1 for _ in reader.messages()) == 301
     record = read_records(tmp_path / "bag")["front_left"]
-    corpus.assert_read(record, truth)
+    assert_read(record, truth)
     bag.close()

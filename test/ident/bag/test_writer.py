@@ -6,11 +6,11 @@ from __future__ import annotations
 import threading
 import tracemalloc
 from pathlib import Path
-from types import SimpleNamespace
 
 import pytest
 import yaml
 from mcap.reader import make_reader
+from recordings import TYPES, Sent, assert_read, motion, serialized, write_mcap, write_sqlite
 from rosbags.highlevel import AnyReader
 
 from smp_motor_ident.bag import BagWriter, read_records
@@ -20,17 +20,17 @@ from smp_motor_ident.errors import BagError
 FLOAT = "std_msgs/msg/Float64"
 
 
-def float_bytes(corpus: SimpleNamespace, value: float) -> bytes:
-    data: bytes = corpus.serialized(FLOAT, data=value)
+def float_bytes(value: float) -> bytes:
+    data: bytes = serialized(FLOAT, data=value)
     return data
 
 
-def test_metadata_are_those_of_version_nine(tmp_path: Path, corpus: SimpleNamespace) -> None:
+def test_metadata_are_those_of_version_nine(tmp_path: Path) -> None:
     with BagWriter(tmp_path / "bag") as bag:
         bag.add_topic("/b", FLOAT, [{"reliability": "best_effort", "depth": 7}])
-        bag.write("/a", FLOAT, float_bytes(corpus, 1.0), 1_000)
-        bag.write("/b", FLOAT, float_bytes(corpus, 2.0), 3_000)
-        bag.write("/b", FLOAT, float_bytes(corpus, 2.0), 2_000)
+        bag.write("/a", FLOAT, float_bytes(1.0), 1_000)
+        bag.write("/b", FLOAT, float_bytes(2.0), 3_000)
+        bag.write("/b", FLOAT, float_bytes(2.0), 2_000)
     document = yaml.safe_load((tmp_path / "bag" / "metadata.yaml").read_text())
     information = document["rosbag2_bagfile_information"]
     assert information["version"] == 9
@@ -48,16 +48,14 @@ def test_metadata_are_those_of_version_nine(tmp_path: Path, corpus: SimpleNamesp
     qos = topics["/b"]["topic_metadata"]["offered_qos_profiles"][0]
     assert (qos["reliability"], qos["depth"], qos["history"]) == ("best_effort", 7, "keep_last")
     # The hash of REP 2011 that ROS 2 Jazzy itself computes for std_msgs/msg/Float64.
-    expected = corpus.TYPES.hash_rihs01(FLOAT)
+    expected = TYPES.hash_rihs01(FLOAT)
     assert topics["/a"]["topic_metadata"]["type_description_hash"] == expected
 
 
-def test_the_file_is_indexed_and_checked_by_the_mcap_library(
-    tmp_path: Path, corpus: SimpleNamespace
-) -> None:
+def test_the_file_is_indexed_and_checked_by_the_mcap_library(tmp_path: Path) -> None:
     with BagWriter(tmp_path / "bag") as bag:
         for k in range(100):
-            bag.write("/a", FLOAT, float_bytes(corpus, k), 1_000 + k)
+            bag.write("/a", FLOAT, float_bytes(k), 1_000 + k)
             if k % 10 == 0:
                 bag.flush(force=True)
     with (tmp_path / "bag" / "bag_0.mcap").open("rb") as file:
@@ -68,16 +66,16 @@ def test_the_file_is_indexed_and_checked_by_the_mcap_library(
         assert summary.statistics.message_count == 100
         assert len(summary.chunk_indexes) == summary.statistics.chunk_count >= 10
         data = [message.data for _, _, message in reader.iter_messages()]
-    assert data == [float_bytes(corpus, k) for k in range(100)]
+    assert data == [float_bytes(k) for k in range(100)]
     schema = next(iter(summary.schemas.values()))
     assert (schema.name, schema.encoding) == (FLOAT, "ros2msg")
     assert b"float64 data" in schema.data
 
 
-def test_every_flush_leaves_a_whole_bag(tmp_path: Path, corpus: SimpleNamespace) -> None:
+def test_every_flush_leaves_a_whole_bag(tmp_path: Path) -> None:
     bag = BagWriter(tmp_path / "bag")
     for k in range(30):
-        bag.write(f"/t{k % 3}", FLOAT, float_bytes(corpus, k), 1_000 + k)
+        bag.write(f"/t{k % 3}", FLOAT, float_bytes(k), 1_000 + k)
         if k % 7 == 0:
             bag.flush(force=True)
             with AnyReader([tmp_path / "bag"]) as reader:
@@ -116,8 +114,8 @@ def test_an_unknown_type_is_kept_without_its_definition(tmp_path: Path) -> None:
     assert [data for _, _, data in Replay(tmp_path / "bag").messages()] == [b"12345678"]
 
 
-def test_many_threads_may_write(tmp_path: Path, corpus: SimpleNamespace) -> None:
-    data = float_bytes(corpus, 1.0)
+def test_many_threads_may_write(tmp_path: Path) -> None:
+    data = float_bytes(1.0)
     with BagWriter(tmp_path / "bag", flush_period=0.001) as bag:
 
         def write(topic: str) -> None:
@@ -134,14 +132,12 @@ def test_many_threads_may_write(tmp_path: Path, corpus: SimpleNamespace) -> None
         assert sum(1 for _ in reader.messages()) == 2000
 
 
-def test_replay_gives_messages_in_order_over_chunks_and_files(
-    tmp_path: Path, corpus: SimpleNamespace
-) -> None:
+def test_replay_gives_messages_in_order_over_chunks_and_files(tmp_path: Path) -> None:
     with BagWriter(tmp_path / "bag") as bag:
         for k in range(200):
             # Within a chunk of ten, and from chunk to chunk, stamps come a little out of order.
             stamp = 1_000 + k + (5 if k % 5 == 0 else 0)
-            bag.write(f"/t{k % 2}", FLOAT, float_bytes(corpus, k), stamp)
+            bag.write(f"/t{k % 2}", FLOAT, float_bytes(k), stamp)
             if k % 10 == 9:
                 bag.flush(force=True)
     stamps = [stamp for _, stamp, _ in Replay(tmp_path / "bag").messages()]
@@ -160,35 +156,30 @@ def test_replay_gives_messages_in_order_over_chunks_and_files(
         ("17", (True, False)),
     ],
 )
-def test_recorded_qos_of_every_version_is_understood(
-    corpus: SimpleNamespace, qos: str, expected: tuple[bool, bool]
-) -> None:
+def test_recorded_qos_of_every_version_is_understood(qos: str, expected: tuple[bool, bool]) -> None:
     from smp_motor_ident.bag.storage import Channel
 
     assert find_offered_qos(Channel(1, "/a", FLOAT, qos=qos)) == expected
 
 
 @pytest.mark.parametrize("storage", ["mcap", "db3"])
-def test_unmapped_topics_take_no_memory(
-    tmp_path: Path, corpus: SimpleNamespace, storage: str
-) -> None:
-    truth = corpus.motion(n=500)
+def test_unmapped_topics_take_no_memory(tmp_path: Path, storage: str) -> None:
+    truth = motion(n=500)
     image = bytes(200_000)
     images = [
-        corpus.Sent("/camera", "std_msgs/msg/UInt8MultiArray", int(t), image)
-        for t in truth.time[::5]
+        Sent("/camera", "std_msgs/msg/UInt8MultiArray", int(t), image) for t in truth.time[::5]
     ]
     messages = sorted(truth.messages() + images, key=lambda sent: sent.stamp)
     if storage == "mcap":
-        path = corpus.write_mcap(tmp_path / "bag.mcap", messages, chunk_size=1 << 20)
+        path = write_mcap(tmp_path / "bag.mcap", messages, chunk_size=1 << 20)
     else:
-        path = corpus.write_sqlite(tmp_path / "bag.db3", messages)
+        path = write_sqlite(tmp_path / "bag.db3", messages)
     assert path.stat().st_size > 20_000_000
     read_records(path)  # load modules before measuring
     tracemalloc.start()
     record = read_records(path)["front_left"]
     _, peak = tracemalloc.get_traced_memory()
     tracemalloc.stop()
-    corpus.assert_read(record, truth)
+    assert_read(record, truth)
     # A few chunks of a megabyte at a time, of twenty.
     assert peak < 6_000_000

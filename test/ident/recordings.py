@@ -7,12 +7,10 @@ import sqlite3
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import mcap.writer
 import numpy as np
-import pytest
 import yaml
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
@@ -20,7 +18,7 @@ from rosbags.typesys.store import Typestore
 from smp_motor_ident.bag import read_records
 from smp_motor_ident.record import Record
 
-ROOT = Path(__file__).resolve().parents[3]
+ROOT = Path(__file__).resolve().parents[2]
 STATE = "smp_interfaces/msg/MotorState"
 DESCRIPTION = "smp_interfaces/msg/MotorDescription"
 START = 1_700_000_000_000_000_000
@@ -292,13 +290,3 @@ def read(path: Path, messages: Iterable[Sent], mapping: Any = None) -> Record:
     path.unlink(missing_ok=True)
     write_mcap(path, messages)
     return next(iter(read_records(path, mapping).values()))
-
-
-@pytest.fixture(scope="session")
-def corpus() -> SimpleNamespace:
-    """What makes recordings; see the functions of this file."""
-    names = (
-        "STATE DESCRIPTION START RATIO COUNTS TYPES Sent Motion motion merged header stamp_of "
-        "serialized definition write_mcap write_sqlite write_metadata assert_read read"
-    )
-    return SimpleNamespace(**{name: globals()[name] for name in names.split()})
