@@ -17,6 +17,7 @@ from typing import IO
 
 import hypothesis
 import pytest
+from wheel_robot import WheelRobot
 
 # Imported before numpy: as the executables do, tests leave linear algebra one thread.
 import smp_motor_control.entry  # noqa: F401
@@ -188,6 +189,14 @@ def process(tmp_path: Path, ros_domain: int) -> Iterator[Callable[..., TestProce
     yield start
     for one in reversed(started):
         one.end()
+
+
+@pytest.fixture
+def robot(ros_domain: int) -> Iterator[WheelRobot]:
+    """Return a node that commands wheels and stores their states."""
+    robot = WheelRobot(ros_domain)
+    yield robot
+    robot.close()
 
 
 @pytest.fixture

@@ -17,13 +17,6 @@ TRUE_GAIN = 25.548
 """Of motor 1, K / (R b + K^2) of Table 1 [rad/s/V]."""
 
 
-@pytest.fixture
-def robot(ros_domain: int) -> Iterator[WheelRobot]:
-    robot = WheelRobot(ros_domain)
-    yield robot
-    robot.close()
-
-
 def test_it_demands_motion_before_it_names_a_number_and_then_names_the_right_one(
     process, robot, eventually
 ):

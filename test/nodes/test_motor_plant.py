@@ -19,13 +19,6 @@ from smp_interfaces.msg import MotorCommand, MotorDescription
 PAPER = Path(__file__).parents[2] / "config" / "motors_paper.yaml"
 
 
-@pytest.fixture
-def robot(ros_domain: int) -> Iterator[WheelRobot]:
-    robot = WheelRobot(ros_domain)
-    yield robot
-    robot.close()
-
-
 def test_plant_turns_on_commands_stops_without_and_describes_itself(process, robot, eventually):
     plant = process("motor_plant", "--ros-args", "-p", "rate:=100.0")
     front, idle = robot.states["front_left"], robot.states["rear_right"]

@@ -99,7 +99,7 @@ def test_odometry_has_no_spikes_after_stalls(skid_steer, peer, eventually) -> No
             peer.spin_for(0.01)
         started.send_signal(signal.SIGCONT)
         before = len(peer.odometry)
-        repeatedly(peer, roll, lambda before=before: len(peer.odometry) > before + 20, eventually)
+        repeatedly(peer, roll, lambda before=before: len(peer.odometry) > before + 10, eventually)
     speeds = [m.twist.twist.linear.x for m in peer.odometry[30:]]
     assert min(speeds) > 0.8 * 0.2
     assert max(speeds) < 1.2 * 0.2

@@ -45,13 +45,6 @@ class Feed:
 
 
 @pytest.fixture
-def robot(ros_domain: int) -> Iterator[WheelRobot]:
-    robot = WheelRobot(ros_domain)
-    yield robot
-    robot.close()
-
-
-@pytest.fixture
 def start(process, robot, eventually):
     def begin(*given: str):
         parameters = [part for one in given for part in ("-p", one)]

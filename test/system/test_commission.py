@@ -20,13 +20,6 @@ Process = Callable[..., Any]
 ROOT = Path(__file__).resolve().parents[2]
 
 
-@pytest.fixture
-def robot(ros_domain: int) -> Iterator[WheelRobot]:
-    robot = WheelRobot(ros_domain)
-    yield robot
-    robot.close()
-
-
 TWO = ("front_left", "rear_left")
 
 BUSY = (

@@ -39,13 +39,6 @@ TIMEOUT = 2.0
 """Longest time-out of all [s], with a second for /diagnostics and a busy machine."""
 
 
-@pytest.fixture
-def robot(ros_domain: int) -> Iterator[WheelRobot]:
-    robot = WheelRobot(ros_domain)
-    yield robot
-    robot.close()
-
-
 def stamp(message: MotorState | MotorCommand) -> float:
     return message.header.stamp.sec + 1e-9 * message.header.stamp.nanosec
 
@@ -84,9 +77,9 @@ class Campaign:
         )
 
     def is_sound(self) -> None:
-        """Drive for as long as it takes until the tries of the last fault are forgotten."""
+        """Wait until the wheel drives by itself again, then clear the tries of the last fault."""
         self.drives()
-        self.robot.spin_for(2.5)
+        self.robot.trigger(NODE, "reset")
         self.drives()
 
     def stops(self, within: float = TIMEOUT) -> None:
