@@ -89,30 +89,6 @@ def make_odometry(**more: float) -> Odometry:
     return Odometry(wheel_separation=0.5, left_radius=0.1, right_radius=0.1, **more)
 
 
-@pytest.mark.parametrize("dt", [0.0, -0.1, math.nan, math.inf])
-def test_odometry_ignores_time_that_does_not_pass(dt: float) -> None:
-    odometry = make_odometry()
-    assert not odometry.update_from_velocity(1.0, 1.0, dt)
-    assert (odometry.x, odometry.linear) == (0.0, 0.0)
-
-
-def test_odometry_ignores_nan_and_goes_on() -> None:
-    odometry = make_odometry()
-    assert not odometry.update_from_velocity(math.nan, 1.0, 0.1)
-    assert not odometry.update_from_position(1.0, math.nan, 0.1)
-    assert odometry.update_from_velocity(10.0, 10.0, 0.1)
-    assert odometry.x == pytest.approx(0.1)
-
-
-def test_a_counter_reset_adds_no_motion() -> None:
-    odometry = make_odometry(max_wheel_speed=5.0)
-    odometry.update_from_position(100.0, 100.0, 0.02)
-    assert odometry.update_from_position(100.05, 100.05, 0.02)
-    assert not odometry.update_from_position(0.0, 0.0, 0.02)
-    assert odometry.update_from_position(0.05, 0.05, 0.02)
-    assert odometry.x == pytest.approx(0.01)
-
-
 def test_covariance_agrees_with_a_thousand_noisy_drives() -> None:
     travel_noise, turn_noise, steps, drives = 4e-4, 1e-2, 100, 1000
     rng = np.random.default_rng(5)

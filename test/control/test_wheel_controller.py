@@ -11,11 +11,9 @@ import pytest
 from wheel_world import (
     DT,
     FEEDBACK_TIMEOUT,
-    GAIN,
     GAINS,
     SETPOINT_TIMEOUT,
     SETTINGS,
-    SUPPLY,
     TAU,
     World,
     asking,
@@ -29,7 +27,6 @@ from wheel_world import (
 )
 
 from smp_motor_control.encoder import Encoder
-from smp_motor_control.motor.model import MotorModel
 from smp_motor_control.motor.parameters import Gearbox
 from smp_motor_control.wheel.controller import State
 from smp_motor_control.wheel.faults import Fault
@@ -163,18 +160,6 @@ def test_parameters_that_cannot_be_computed_stop_the_wheel_and_nothing_else(monk
     world.until(lambda: abs(world.speed - 1.5) < 0.15, 5.0)
 
 
-def test_inactive_wheel_answers_nothing_and_starts_afresh():
-    world = World().run(1.0)
-    world.wheel.deactivate()
-    answers = len(world.log)
-    world.held = 0.0
-    world.run(1.0)
-    assert all(voltage == 0.0 for _, voltage, _ in world.log[answers:])
-    assert world.wheel.state is State.INACTIVE
-    world.wheel.activate(world.now)
-    world.until(lambda: abs(world.speed - 1.5) < 0.15, 1.0)
-
-
 def test_supply_limits_the_voltage_and_hardware_without_one_is_refused():
     world = World(replace(SETTINGS, loop=LoopSettings(gains=replace(GAINS, p=100.0))))
     world.wheel.set_hardware(Gearbox(65.5), Encoder(), 5.0)
@@ -188,13 +173,3 @@ def test_supply_limits_the_voltage_and_hardware_without_one_is_refused():
             world.wheel.set_hardware(Gearbox(65.5), Encoder(), 12.0, resistance)
     world.run(1.0)
     assert max(abs(voltage) for _, voltage, _ in world.log) <= 5.0
-
-
-def test_gains_that_suit_no_such_feedback_are_named_once_its_rate_is_known():
-    model = MotorModel(dc_gain=GAIN * 65.5, time_constant=TAU)
-    # One sample late, half a sample averaged: at 10 ms a third of this is the limit.
-    gains = replace(GAINS, p=60.0, i=0.0)
-    world = World(replace(SETTINGS, loop=LoopSettings(gains=gains, model=model)))
-    world.wheel.set_hardware(Gearbox(65.5), Encoder(), SUPPLY)
-    world.run(0.5)
-    assert "unstable on the motor's model at intervals of 10 ms" in world.wheel.advice

@@ -82,12 +82,6 @@ def test_a_speed_that_has_nothing_to_do_with_the_voltage_is_refused():
         estimate(replace(GOOD, count=None, velocity=noise).slice(0, N // 2))
 
 
-def test_an_angle_that_stops_half_way_is_a_dead_encoder():
-    angle = GOOD.count[np.minimum(np.arange(N), N // 2)] * motors.QUANTUM
-    with pytest.raises(SignalError, match="dead encoder, the position stays"):
-        estimate(replace(GOOD, count=None, velocity=None, position=angle))
-
-
 def test_a_current_clipped_by_a_two_level_command_is_saturated():
     random = np.repeat(np.sign(np.random.default_rng(2).standard_normal(N // 40)), 40) * 8.0
     good = motors.record("rear_left", voltage=random, seconds=4.0)
@@ -161,20 +155,6 @@ def test_gaps_of_nan_are_left_out_and_reported():
     result = estimate(replace(GOOD, current=amps))
     assert any(f.code == "samples_lost" for f in result.findings)
     assert result.value("resistance") == pytest.approx(3.2843, rel=2e-3)
-
-
-@pytest.mark.parametrize("first", [0, 50])
-def test_one_step_does_not_pretend_to_separate_gain_from_friction(first):
-    """A step in the first row or later tells K (u - F) alone: 27.66 rad/s/V times 7.7 V."""
-    volts = np.where(np.arange(1000) < first, 0.0, 8.0)
-    found = estimate(motors.record("rear_left", current=False, voltage=volts, kinds=("sine",)))
-    for name in ("dc_gain", "static_voltage"):
-        q = found.combinations[name]
-        low, high = q.total_ci95 or q.ci95
-        true = motors.truth("rear_left", 0.3)[name]
-        assert low <= true <= high and high - low > 0.3 * true
-    speed, truth = found.combinations["steady_speed"], motors.truth("rear_left", 0.3)
-    assert abs(speed.value - truth["dc_gain"] * 7.7) < 3 * speed.std
 
 
 def test_what_next_stays_within_the_recorded_range():

@@ -4,10 +4,8 @@
 from __future__ import annotations
 
 import signal
-from collections.abc import Iterator
 
 import pytest
-from wheel_robot import WheelRobot
 
 from smp_motor_control.errors import ParameterError
 from smp_motor_control.nodes.excite import Settings

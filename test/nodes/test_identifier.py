@@ -5,11 +5,8 @@ from __future__ import annotations
 
 import math
 import signal
-from collections.abc import Iterator
 
-import pytest
 from rclpy.qos import DurabilityPolicy, QoSProfile
-from wheel_robot import WheelRobot
 
 from smp_interfaces.msg import MotorParameters
 

@@ -6,13 +6,11 @@ from __future__ import annotations
 import math
 import signal
 import time
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from std_msgs.msg import String
-from wheel_robot import WheelRobot
 
 from smp_interfaces.msg import MotorCommand, MotorDescription
 

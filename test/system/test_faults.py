@@ -14,7 +14,7 @@ import random
 import signal
 import struct
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 
 import pytest
 from geometry_msgs.msg import TwistStamped

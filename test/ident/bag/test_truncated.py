@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import random
 import sqlite3
 from pathlib import Path
 
@@ -132,20 +131,6 @@ def test_a_damaged_chunk_costs_only_itself(tmp_path: Path) -> None:
     assert 360 <= count < 400
     assert "is damaged and was left out with" in words
     assert f"{count} of 400 messages" in words
-
-
-def test_random_damage_never_ends_in_a_traceback(tmp_path: Path) -> None:
-    truth = motion(n=60)
-    chance = random.Random(4)
-    for storage, write in (("mcap", write_mcap), ("db3", write_sqlite)):
-        path = write(tmp_path / f"bag.{storage}", truth.messages())
-        whole = path.read_bytes()
-        for _ in range(60):
-            data = bytearray(whole)
-            for _ in range(chance.choice((1, 3, 30))):
-                data[chance.randrange(len(data))] = chance.randrange(256)
-            path.write_bytes(data)
-            samples_and_words(path)
 
 
 def test_a_tail_of_zeros_is_not_a_message(tmp_path: Path) -> None:
