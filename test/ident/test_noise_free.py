@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Records without any noise, as a simulator writes them, are a motor's like others."""
 
+from functools import cache
+
 import numpy as np
 import pytest
 from independent import excitation, simulate
@@ -18,12 +20,18 @@ TRUTH = {
 }  # fmt: skip
 
 
-def _record(kind: str, signal: str, current: bool, rate: float = 500.0) -> Record:
-    t = np.arange(int(8 * rate)) / rate
+@cache
+def _motion(
+    kind: str, seconds: float, rate: float = 500.0
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return time, voltage, and the motor's current, speed and angle."""
+    t = np.arange(int(seconds * rate)) / rate
     v = excitation(t, kind, 9.0)
-    if kind == "step":
-        v[:20] = 0.0
-    out = simulate(t, v, R, L, K, J, B, TC, np.zeros(t.size), 2000)
+    return t, v, simulate(t, v, R, L, K, J, B, TC, np.zeros(t.size), 2000)
+
+
+def _record(kind: str, signal: str, current: bool) -> Record:
+    t, v, out = _motion(kind, 8.0 if signal == "counts" else 4.0)  # 64 a turn tell less
     motion: dict[str, np.ndarray] = {
         "counts": {"count": np.floor(out[:, 2] * 64 / (2 * np.pi)).astype(np.int64)},
         "speed": {"velocity": out[:, 1].copy()},
