@@ -21,13 +21,7 @@ CHROMIUM = next(
 
 
 class Browser:
-    """One page of a browser with its requests and errors.
-
-    Parameters
-    ----------
-    profile : Path
-        Folder for the browser's files.
-    """
+    """One page of a browser, whose files are in ``profile``, with its requests and errors."""
 
     def __init__(self, profile: Path) -> None:
         mine, its = os.pipe(), os.pipe()  # commands go out, answers come in

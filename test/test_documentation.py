@@ -30,6 +30,7 @@ from smp_motor_control import WHEELS
 from smp_motor_control.motor import Motor
 from smp_motor_control.motor.file import load_motors
 from smp_motor_control.ros_arguments import split_arguments
+from smp_motor_control.serial_protocol import decode_state, encode_age, encode_voltages
 from smp_motor_ident.bag.writer import BagWriter
 from smp_motor_ident.cli import commission, demo, identify, tune
 from smp_motor_ident.nodes import play, record
@@ -334,18 +335,26 @@ int main() {
 """
 
 
-def test_the_firmware_of_the_page_speaks_the_protocol_and_stops_on_silence(tmp_path):
-    from smp_motor_control.serial_protocol import decode_state, encode_voltages
-
-    (tmp_path / "sketch.ino").write_text(program("docs/howto/micro-controller.md", "cpp"))
-    (tmp_path / "board.cpp").write_text(BOARD)
+@pytest.fixture(scope="module")
+def board(tmp_path_factory):
+    """Return the page's firmware on a computer: lines to the board give its answers."""
+    folder = tmp_path_factory.mktemp("firmware")
+    (folder / "sketch.ino").write_text(program("docs/howto/micro-controller.md", "cpp"))
+    (folder / "board.cpp").write_text(BOARD)
     build = ["c++", "-Wall", "-Werror", "-o", "board", "board.cpp"]
-    subprocess.run(build, cwd=tmp_path, check=True, timeout=120)
+    subprocess.run(build, cwd=folder, check=True, timeout=120)
+
+    def run(said: str) -> list[str]:
+        return subprocess.run([folder / "board"], input=said, capture_output=True, text=True,
+                              check=True, timeout=60).stdout.splitlines()  # fmt: skip
+
+    return run
+
+
+def test_the_firmware_of_the_page_speaks_the_protocol_and_stops_on_silence(board):
     good = encode_voltages([3.0, -6.0]).decode()
     said = f"{good}{good.replace('3000', '9000')}+150000\n+150000\n"
-    ran = subprocess.run([tmp_path / "board"], input=said, capture_output=True, text=True,
-                         check=True, timeout=60)  # fmt: skip
-    lines = ran.stdout.splitlines()
+    lines = board(said)
     states = [decode_state(line, 2) for line in lines if line.startswith("S")]
     # 818 of 1023 at 15 V full scale.
     assert states[0].battery == pytest.approx(818 * 15 / 1023, abs=1e-3)
@@ -355,19 +364,12 @@ def test_the_firmware_of_the_page_speaks_the_protocol_and_stops_on_silence(tmp_p
     assert duty == [63, 63, 63, 0]
 
 
-def test_the_firmware_of_the_page_drops_commands_that_waited_in_a_queue(tmp_path):
-    from smp_motor_control.serial_protocol import encode_age, encode_voltages
-
-    (tmp_path / "sketch.ino").write_text(program("docs/howto/micro-controller.md", "cpp"))
-    (tmp_path / "board.cpp").write_text(BOARD)
-    subprocess.run(["c++", "-o", "board", "board.cpp"], cwd=tmp_path, check=True, timeout=120)
+def test_the_firmware_of_the_page_drops_commands_that_waited_in_a_queue(board):
     # Each line takes 10 ms of the board's clock; the command of 3 V answers its sample at 10 ms.
     command = encode_age(10_000).decode() + encode_voltages([3.0, 3.0]).decode()
     fresh = encode_age(1_440_000).decode() + encode_voltages([6.0, 6.0]).decode()
     said = command + "+1400000\n" + command + fresh
-    ran = subprocess.run([tmp_path / "board"], input=said, capture_output=True, text=True,
-                         check=True, timeout=60)  # fmt: skip
-    duty = [int(line.split()[2]) for line in ran.stdout.splitlines() if line.startswith("pwm 5")]
+    duty = [int(line.split()[2]) for line in board(said) if line.startswith("pwm 5")]
     assert duty == [0, 63, 0, 0, 0, 0, 127]
 
 
@@ -407,7 +409,7 @@ def test_our_names_in_the_table_of_ros2_controllers_are_parameters():
     text = (ROOT / "docs/ros2-controllers.md").read_text()
     topics = set(re.findall(r"`([\w/<>~]+)`", (ROOT / "docs/nodes.md").read_text())) | {"/tf"}
     names = known("skid_steer"), known("wheel_pid"), topics
-    for there, part in zip(names, text.split("\n## ")[1:], strict=True):
+    for there, part in zip(names, text.split("\n ")[1:], strict=True):
         rows = [line.split("|") for line in part.splitlines() if line.startswith("| ")][1:]
         ours = {name for row in rows for name in re.findall(r"`([\w./<>~]+)`", row[2])}
         assert ours <= there

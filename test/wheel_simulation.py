@@ -1,10 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One wheel in open and closed loop without ROS, faster than real time.
-
-Made of the parts that run on the robot: :class:`~smp_motor_control.motor.hardware.DrivenMotor`
-is what ``motor_plant`` simulates, :class:`~smp_motor_control.wheel.loop.WheelLoop` what
-``wheel_pid`` computes.
-"""
+"""One wheel in open and closed loop without ROS, made of the parts that run on the robot."""
 
 from __future__ import annotations
 
@@ -26,43 +21,19 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, kw_only=True)
 class Timing:
-    """When samples are taken and commands arrive.
-
-    Attributes
-    ----------
-    sample_time : float
-        Interval between samples [s].
-    delay : float
-        From a sample to the arrival of the command that answers it [s].
-    jitter : float
-        Standard deviation of the intervals between samples [s].
-    """
+    """When samples are taken and, ``delay`` later, their commands arrive [s]."""
 
     sample_time: float = 0.005
     delay: float = 0.0
-    jitter: float = 0.0
+    jitter: float = 0.0  # standard deviation of the intervals
 
 
 @dataclass(frozen=True, eq=False)
 class Run:
-    """Signals of one simulated wheel at its sampling instants, each of shape (n,).
+    """Signals of one simulated wheel at its sampling instants, the true motion at the wheel.
 
-    Attributes
-    ----------
-    time : ndarray
-        [s].
-    setpoint, reference, measurement : ndarray
-        Of the loop [rad/s, wheel]; zero in open loop.
-    velocity, position : ndarray
-        True ones, of the wheel [rad/s], [rad].
-    voltage : ndarray
-        Mean over the interval that ends with the sample [V].
-    command : ndarray
-        Answer to the sample [V].
-    current : ndarray
-        As measured [A].
-    count : ndarray of int64
-        As the counter shows it.
+    Set-point, reference and measurement are zero in open loop; the voltage is the mean over the
+    interval that ends with the sample, the command its answer.
     """
 
     time: Array

@@ -7,6 +7,7 @@ import math
 
 import numpy as np
 import pytest
+from paper_motors import paper_motor
 from scipy.linalg import expm
 
 from smp_motor_control.encoder import DifferencedSpeed, Encoder
@@ -15,33 +16,15 @@ from smp_motor_control.motor import Motor, MotorParameters
 from smp_motor_control.motor.model import MotorModel
 from smp_motor_control.observer import ObserverNoise, SpeedObserver, prediction, steady_gain
 
-# Table 1 of the paper, motors 1 (oscillating poles) and 2 (real poles), and one without L.
+# Motors 1 (oscillating poles) and 2 (real poles) of the paper, and one without L.
 MOTORS = {
-    "motor 1": MotorParameters(
-        resistance=12.919,
-        inductance=0.30994,
-        motor_constant=0.011029,
-        inertia=1.13e-6,
-        viscous_friction=2.4e-5,
-        coulomb_friction=3.8e-4,
-    ),
-    "motor 2": MotorParameters(
-        resistance=4.5516,
-        inductance=0.06754,
-        motor_constant=0.001761,
-        inertia=6.6e-7,
-        viscous_friction=2.23e-5,
-        coulomb_friction=1.5e-4,
-    ),
+    "motor 1": paper_motor("front_left", 0.445),
+    "motor 2": paper_motor("front_right", 0.388),
     "first order": MotorParameters(
-        resistance=3.0,
-        inductance=0.0,
-        motor_constant=0.03,
-        inertia=1.4e-5,
-        viscous_friction=5e-5,
+        resistance=3.0, inductance=0.0, motor_constant=0.03, inertia=1.4e-5, viscous_friction=5e-5,
         coulomb_friction=0.0,
     ),
-}
+}  # fmt: skip
 ENCODER = Encoder(500.0)
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import numba
 import numpy as np
+from paper_motors import TABLE_1  # noqa: F401
 
 
 @numba.njit(cache=True)
@@ -65,15 +66,6 @@ def simulate(t, v, r, l, k, j, b, tc, load, substeps):
             i, w = i1, w1
         out[m] = i, w, angle
     return out
-
-
-TABLE_1 = {
-    "front_left": (12.919, 0.30994, 0.011029, 1.13e-6, 2.40e-5),
-    "front_right": (4.5516, 0.06754, 0.001761, 6.60e-7, 2.23e-5),
-    "rear_left": (3.2843, 0.06383, 0.030117, 1.40e-5, 5.53e-5),
-    "rear_right": (2.7031, 0.03995, 0.035314, 2.21e-5, 6.45e-5),
-}
-"""The paper's Table 1: R [ohm], L [H], K [V s/rad], J [kg m^2], b [N m s/rad]."""
 
 
 def excitation(t, kind, amplitude=12.0, seed=0):

@@ -127,8 +127,33 @@ def motion(
 
 def merged(*motions: Motion, **options: Any) -> list[Sent]:
     """Return the messages of several motors in the order of their stamps."""
-    every = [sent for one in motions for sent in one.messages(**options)]
-    return sorted(every, key=lambda sent: sent.stamp)
+    return in_order(*(one.messages(**options) for one in motions))
+
+
+def floats(topic: str, times: Iterable[int], values: Iterable[float]) -> list[Sent]:
+    """Return messages of a number."""
+    kind = "std_msgs/msg/Float64"
+    return [
+        Sent(topic, kind, int(t), serialized(kind, data=float(v))) for t, v in zip(times, values)
+    ]
+
+
+def joint_state(at: int, names: list[str], velocity: Iterable[float], **more: Any) -> Sent:
+    """Return the speeds of joints; ``more`` are other fields, or the topic."""
+    kind, none = "sensor_msgs/msg/JointState", np.zeros(0)
+    topic, stamp = more.pop("topic", "/joint_states"), more.pop("stamp", at)
+    fields = {"header": header(stamp), "position": none, "effort": none, **more}
+    speeds = np.array(velocity, float)
+    return Sent(topic, kind, int(at), serialized(kind, name=names, velocity=speeds, **fields))
+
+
+def in_order(*parts: list[Sent]) -> list[Sent]:
+    return sorted((sent for part in parts for sent in part), key=lambda sent: sent.stamp)
+
+
+def notes(record: Record) -> str:
+    """Return the messages of all findings."""
+    return " ".join(finding.message for finding in record.findings)
 
 
 def definition(type_name: str) -> str:

@@ -3,14 +3,13 @@
 
 from __future__ import annotations
 
-import importlib
 import json
 import math
-import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
+from bench_scripts import load
 from scipy.linalg import expm
 
 from smp_motor_ident.cli.identify import main
@@ -38,27 +37,21 @@ LOOPS = {
 """Interval, gains, and the target's unit of a wheel's rad/s."""
 
 
-@pytest.fixture(scope="module")
-def laws():
-    """Return the laws of the benchmark, written from the targets' documentation."""
-    sys.path.insert(0, str(ROOT / "benchmarks"))
-    try:
-        bench = importlib.import_module("exports")
-        # The laws are for the paper's gearbox and encoder; use this motor's speeds as theirs.
-        return bench.LAWS, bench.RATIO, bench.COUNTS
-    finally:
-        sys.path.remove(str(ROOT / "benchmarks"))
+# Written from the targets' documentation for the paper's gearbox and encoder: use this motor's
+# speeds as theirs.
+BENCH = load("exports")
+RATIO, COUNTS = BENCH.RATIO, BENCH.COUNTS
 
 
-def drive(laws, name: str, seconds: float = 20.0, seed: int = 3):
+def drive(name: str, seconds: float = 20.0, seed: int = 3):
     """Drive the motor by the benchmark's law; return set-points, speeds and voltages."""
-    (table, ratio, counts), (T, numbers, unit) = laws, LOOPS[name]
+    ratio, counts, (T, numbers, unit) = RATIO, COUNTS, LOOPS[name]
     unit = unit or counts * ratio / (2 * math.pi) * T
     A = np.zeros((4, 4))
     A[0, 1], A[2, 0] = 1.0, 1.0
     A[1] = (-1 / (LAG * FAST), -(LAG + FAST) / (LAG * FAST), 0.0, GAIN / (LAG * FAST))
     advance = expm(A * T)
-    law, rng = table[name](numbers, T), np.random.default_rng(seed)
+    law, rng = BENCH.LAWS[name](numbers, T), np.random.default_rng(seed)
     n = round(seconds / T)
     targets = np.repeat(rng.uniform(-150.0, 150.0, n // 20 + 1), 20)[:n] / ratio
     if name == "ros_arduino_bridge":  # whole ticks, and none that is 0, which stops this board
@@ -79,12 +72,11 @@ def drive(laws, name: str, seconds: float = 20.0, seed: int = 3):
     return T * np.arange(n), logged, speed, volts
 
 
-def record(laws, time, setpoints, speed, **hardware) -> Record:
+def record(time, setpoints, speed, **hardware) -> Record:
     """Return the record as the reader gives it: a set-point holds from its row on."""
-    _, ratio, counts = laws
-    known = {"gear_ratio": ratio, "counts_per_revolution": counts, "supply_voltage": SUPPLY}
+    known = {"gear_ratio": RATIO, "counts_per_revolution": COUNTS, "supply_voltage": SUPPLY}
     held = np.concatenate(([0.0], setpoints[:-1]))
-    return Record("left", time, held, velocity=speed * ratio, hardware=Hardware(**known | hardware))
+    return Record("left", time, held, velocity=speed * RATIO, hardware=Hardware(**known | hardware))
 
 
 def given(name: str) -> dict[str, float]:
@@ -92,27 +84,26 @@ def given(name: str) -> dict[str, float]:
 
 
 @pytest.mark.parametrize("name", LOOPS)
-def test_the_command_is_reconstructed(laws, name):
-    time, setpoints, speed, volts = drive(laws, name)
+def test_the_command_is_reconstructed(name):
+    time, setpoints, speed, volts = drive(name)
     # Nine digits, as logs have them.
     rounded = np.array([float(f"{v:.9g}") for v in speed])
-    got = reconstruct(record(laws, time, setpoints, rounded), FORMATS[name].known, given(name))
+    got = reconstruct(record(time, setpoints, rounded), FORMATS[name].known, given(name))
     # Of two independent writings of the rule; a whole number may fall to the other side once.
     assert np.mean(np.abs(got.voltage[1:] - volts[:-1]) > 0.05) < 0.01
     assert [f.code for f in got.findings] == ["reconstructed_voltage"]
 
 
 @pytest.mark.parametrize("name", ["linorobot2", "arduino_pid"])
-def test_the_motor_is_identified_through_the_loop(laws, name, tmp_path):
-    time, setpoints, speed, _ = drive(laws, name)
+def test_the_motor_is_identified_through_the_loop(name, tmp_path):
+    time, setpoints, speed, _ = drive(name)
     log = tmp_path / "log.csv"
     np.savetxt(log, np.column_stack((time, setpoints, speed)), delimiter=",", comments="",
                header="t,target,speed", fmt="%.9g")  # fmt: skip
-    _, ratio, counts = laws
     numbers = [f"{k}={v}" for k, v in LOOPS[name][1].items()]
     code = main([str(log), "--controller", name, *numbers, "--quiet", "--output",
                  str(tmp_path / "r"), "--map", "time=t", "setpoint=target", "velocity=speed",
-                 f"gear_ratio={ratio}", f"counts_per_revolution={counts}",
+                 f"gear_ratio={RATIO}", f"counts_per_revolution={COUNTS}",
                  f"supply_voltage={SUPPLY}"])  # fmt: skip
     assert code == 0
     document = json.loads((tmp_path / "r" / "identification.json").read_text())
@@ -128,25 +119,25 @@ def test_the_motor_is_identified_through_the_loop(laws, name, tmp_path):
     assert "reconstructed_voltage" in [f["code"] for f in motor["findings"]]
 
 
-def test_unknown_commands_are_refused(laws):
+def test_unknown_commands_are_refused():
     loop, numbers = FORMATS["arduino_pid"].known, given("arduino_pid")
-    time, setpoints, speed, _ = drive(laws, "arduino_pid", 6.0)
-    whole = record(laws, time, setpoints, speed)
+    time, setpoints, speed, _ = drive("arduino_pid", 6.0)
+    whole = record(time, setpoints, speed)
     with pytest.raises(SignalError, match="begins while the loop is running"):
         reconstruct(whole.slice(100, 400), loop, numbers)
     with pytest.raises(SignalError, match="ran every 20 ms"):
         reconstruct(whole, loop, numbers | {"SampleTime": 20})
     with pytest.raises(SignalError, match="the supply is unknown"):
-        reconstruct(record(laws, time, setpoints, speed, supply_voltage=None), loop, numbers)
-    coarse = record(laws, time, setpoints, np.round(speed, 1), counts_per_revolution=None)
+        reconstruct(record(time, setpoints, speed, supply_voltage=None), loop, numbers)
+    coarse = record(time, setpoints, np.round(speed, 1), counts_per_revolution=None)
     with pytest.raises(SignalError, match=r"logged in steps of 0\.1 rad/s.*log more digits"):
         reconstruct(coarse, loop, numbers)
 
 
-def test_a_lost_sample_ends_the_known_part_of_the_loop(laws):
-    time, setpoints, speed, volts = drive(laws, "arduino_pid", 6.0)
+def test_a_lost_sample_ends_the_known_part_of_the_loop():
+    time, setpoints, speed, volts = drive("arduino_pid", 6.0)
     kept = np.arange(time.size) != 300
-    one = record(laws, time[kept], setpoints[kept], speed[kept])
+    one = record(time[kept], setpoints[kept], speed[kept])
     got = reconstruct(one, FORMATS["arduino_pid"].known, given("arduino_pid"))
     assert len(got) == 300
     assert "lost_loop" in [f.code for f in got.findings]

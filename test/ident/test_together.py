@@ -3,11 +3,10 @@
 
 from __future__ import annotations
 
-import importlib.util
-import sys
 from pathlib import Path
 
 import pytest
+from bench_scripts import load
 
 from smp_motor_control.motor.file import load_motors
 
@@ -15,27 +14,20 @@ ROOT = Path(__file__).resolve().parents[2]
 ENTRIES = load_motors(ROOT / "config" / "motors_paper.yaml")
 
 
-@pytest.fixture(scope="module")
-def together():
-    path = ROOT / "benchmarks" / "together.py"
-    spec = importlib.util.spec_from_file_location("together", path)
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[spec.name] = module  # dataclasses look their module up
-    spec.loader.exec_module(module)
-    return module
+TOGETHER = load("together")
 
 
 @pytest.fixture(scope="module")
-def found(together):
-    return together.identify_recorded(ENTRIES, 200.0, seed=11, duration=10.0)
+def found():
+    return TOGETHER.identify_recorded(ENTRIES, 200.0, seed=11, duration=10.0)
 
 
 @pytest.mark.parametrize(("rate", "most"), [(100.0, 0.010), (200.0, 0.005), (1000.0, 0.005)])
 def test_four_motors_under_uneven_load_settle_together_without_overshoot(
-    together, found, rate: float, most: float
+    found, rate: float, most: float
 ) -> None:
-    runs = together.compare(ENTRIES, found, rate, seed=11)
-    plain, arrival = (together.assess(runs[way]) for way in ("plain", "together"))
+    runs = TOGETHER.compare(ENTRIES, found, rate, seed=11)
+    plain, arrival = (TOGETHER.assess(runs[way]) for way in ("plain", "together"))
     # The bounds: one control period, 5 ms at 1 kHz; overshoot below 1 %.
     assert arrival.spread <= most
     assert max(arrival.overshoot.values()) < 1.0

@@ -8,19 +8,16 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from paper_motors import TABLE_1
 
 from smp_motor_ident.errors import DesignError
 from smp_motor_ident.result import Estimate, Quantity
 from smp_motor_ident.tune import METHODS, Loop, compare, design, design_wheels, recommend
+from smp_motor_ident.tune.ensemble import UncertaintyEnsemble
 from smp_motor_ident.tune.motors import draw_motors
+from smp_motor_ident.tune.plant import sample
 
-# The paper's Table 1: R, L, K, J, b.
-TABLE_1 = (
-    (12.919, 0.30994, 0.011029, 1.13e-6, 2.40e-5),
-    (4.5516, 0.06754, 0.001761, 6.60e-7, 2.23e-5),
-    (3.2843, 0.06383, 0.030117, 1.40e-5, 5.53e-5),
-    (2.7031, 0.03995, 0.035314, 2.21e-5, 6.45e-5),
-)
+TABLE = tuple(TABLE_1.values())
 PHYSICAL = ("resistance", "inductance", "motor_constant", "inertia", "viscous_friction")
 
 
@@ -31,7 +28,7 @@ def combinations(row):
 
 
 def estimate(k=0, std=0.0, **more) -> Estimate:
-    values = {**combinations(TABLE_1[k]), **more}
+    values = {**combinations(TABLE[k]), **more}
     covariance = np.diag([(std * x) ** 2 for x in values.values()])
     known = {name: Quantity(value) for name, value in values.items()}
     return Estimate("front_left", "second_order", {}, known, tuple(values), covariance)
@@ -47,7 +44,7 @@ def of_parameters(row) -> Estimate:
 def test_combinations_alone_give_the_gains_of_the_true_parameters(k, method):
     loop = Loop()
     known = design(estimate(k), loop, method).gains
-    true = design(of_parameters(TABLE_1[k]), loop, method).gains
+    true = design(of_parameters(TABLE[k]), loop, method).gains
     for name in ("p", "i", "d", "feedforward_velocity", "feedforward_acceleration"):
         assert getattr(known, name) == pytest.approx(getattr(true, name), rel=1e-6, abs=1e-12)
 
@@ -58,7 +55,7 @@ def test_identified_combinations_give_the_gains_of_the_true_ones_within_two_perc
     true = design(estimate(), loop).gains
     for _ in range(5):
         # A tenth of a percent is what 30 s of a Fourier voltage leave, and more.
-        wrong = {n: v * (1 + 1e-3 * rng.normal()) for n, v in combinations(TABLE_1[0]).items()}
+        wrong = {n: v * (1 + 1e-3 * rng.normal()) for n, v in combinations(TABLE[0]).items()}
         gains = design(estimate(0, std=1e-3, **wrong), loop).gains
         for name in ("p", "i", "d"):
             assert getattr(gains, name) == pytest.approx(getattr(true, name), rel=0.02)
@@ -74,7 +71,7 @@ def test_gains_are_volts_per_wheel_speed():
 
 
 def test_feed_forward_is_the_motors_own_equation():
-    one = combinations(TABLE_1[2])
+    one = combinations(TABLE[2])
     gains = design(estimate(2, static_voltage=0.35), Loop(gear_ratio=10.0)).gains
     assert gains.feedforward_velocity == pytest.approx(10.0 / one["dc_gain"])
     assert gains.feedforward_acceleration == pytest.approx(
@@ -102,10 +99,6 @@ def test_uncertainty_makes_the_design_back_off_and_say_so():
 def test_robustness_is_judged_on_fresh_draws_as_well():
     """Gains chosen on one sample of the distribution hold on another, with another seed."""
     one = design(estimate(1, std=0.05), Loop(), seed=1)
-    from smp_motor_ident.tune.ensemble import UncertaintyEnsemble
-    from smp_motor_ident.tune.motors import draw_motors
-    from smp_motor_ident.tune.plant import sample
-
     fresh = sample(draw_motors(estimate(1, std=0.05), 4000, np.random.default_rng(99)), Loop())
     verdict = UncertaintyEnsemble(fresh, METHODS["margin"].required).assess(one.feedback)
     # 99 % of 1000 draws: the binomial spread of a fresh sample is 0.3 %, three of them.
@@ -244,7 +237,7 @@ def four(spread: float) -> dict[str, Estimate]:
     rng = np.random.default_rng(5)
     found = {}
     for wheel in ("front_left", "front_right", "rear_left", "rear_right"):
-        values = {n: v * (1 + spread * rng.normal()) for n, v in combinations(TABLE_1[3]).items()}
+        values = {n: v * (1 + spread * rng.normal()) for n, v in combinations(TABLE[3]).items()}
         found[wheel] = replace(estimate(3, std=0.002, **values), wheel=wheel)
     return found
 
@@ -288,7 +281,7 @@ def test_wheels_together_share_the_limits_of_the_weakest():
         assert one.reference.drive.top_speed <= alone.designs[wheel].reference.drive.top_speed
         # Each motor stays within its own 95 % of 12 V along the common change, apart from peaks
         # between the evaluated instants.
-        motor, profile = combinations(TABLE_1[int(wheel[-1])]), one.reference.profile()
+        motor, profile = combinations(TABLE[int(wheel[-1])]), one.reference.profile()
         profile.set_target(0.9 * one.reference.max_velocity, 0.005)
         seen = [profile.ahead(k * 1e-4) for k in range(int(profile.duration / 1e-4))]
         needed = [

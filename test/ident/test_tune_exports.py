@@ -3,40 +3,32 @@
 
 from __future__ import annotations
 
-import importlib
 import json
 import math
-import sys
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import yaml
+from bench_scripts import load
 from results import estimate
 
 from smp_motor_ident.cli.tune import main
 from smp_motor_ident.report.document import identification_document
-from smp_motor_ident.tune.exports import FORMATS
+from smp_motor_ident.tune import Loop, design
+from smp_motor_ident.tune.exports import FORMATS, check
 
 ROOT = Path(__file__).resolve().parents[2]
 MOTORS = ROOT / "config" / "motors_paper.yaml"
-
-
-@pytest.fixture(scope="module")
-def bench():
-    sys.path.insert(0, str(ROOT / "benchmarks"))
-    try:
-        return importlib.import_module("exports")
-    finally:
-        sys.path.remove(str(ROOT / "benchmarks"))
+BENCH = load("exports")
 
 
 @pytest.mark.parametrize("name", FORMATS)
-def test_the_targets_own_arithmetic_settles_and_overshoots_as_specified(bench, name):
-    motors = [*bench.TABLE_1.values(), *bench.random_motors(1)]
+def test_the_targets_own_arithmetic_settles_and_overshoots_as_specified(name):
+    motors = [*BENCH.TABLE_1.values(), *BENCH.random_motors(1)]
     for motor in motors:
-        _, _, over, overshot, peak, kept = bench.attempt(name, motor)
+        _, _, over, overshot, peak, kept = BENCH.attempt(name, motor)
         # From 1.2 times the settling time on it stays within half a percent of the band: the slow
         # tail of the integral enters at a shallow angle, where counts and PWM steps move it.
         assert kept
@@ -72,16 +64,13 @@ def test_the_command_writes_the_targets_parameters_and_names_its_limitations(
     assert "exists" in capsys.readouterr().err
 
 
-def test_whole_numbers_that_let_an_error_rest_are_named(bench):
-    from smp_motor_ident.tune import Loop, design
-    from smp_motor_ident.tune.exports import check
-
+def test_whole_numbers_that_let_an_error_rest_are_named():
     target = FORMATS["ros_arduino_bridge"]
     loop = Loop(
         sample_time=1 / 30, counts_per_revolution=11.0, speed_source="difference", gear_ratio=30.0
     )
     loop = replace(loop, noise_voltage=3.0)
-    one = design(bench.estimate_of(bench.TABLE_1["rear_left"]), loop, samples=60, **target.targets)
+    one = design(BENCH.estimate_of(BENCH.TABLE_1["rear_left"]), loop, samples=60, **target.targets)
     gains = target.convert(one)
     numbers = gains.numbers
     # An error of one tick less than Ko/Kp is divided to nothing.
@@ -99,14 +88,12 @@ def test_intervals_that_a_target_cannot_have_are_refused_with_the_nearest(tmp_pa
         assert nearest in capsys.readouterr().err
 
 
-def test_a_wheel_blocked_at_full_speed_does_not_overflow_16_bits(bench):
-    from smp_motor_ident.tune import Loop, design
-
+def test_a_wheel_blocked_at_full_speed_does_not_overflow_16_bits():
     target = FORMATS["ros_arduino_bridge"]
     loop = Loop(sample_time=0.033, counts_per_revolution=4000.0, speed_source="difference")
-    one = design(bench.estimate_of(bench.TABLE_1["front_left"]), loop, samples=60, **target.targets)
+    one = design(BENCH.estimate_of(BENCH.TABLE_1["front_left"]), loop, samples=60, **target.targets)
     numbers = target.convert(one).numbers
-    fastest = bench.SUPPLY / bench.combinations(bench.TABLE_1["front_left"])[0]
+    fastest = BENCH.SUPPLY / BENCH.combinations(BENCH.TABLE_1["front_left"])[0]
     assert 0 < numbers["Kd"] * fastest * 4000 / (2 * math.pi) * 0.033 <= 32767
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from independent import simulate
-from recordings import START, Sent, read, serialized
+from recordings import START, floats, in_order, read
 
 from smp_motor_ident.bag import read_records
 from smp_motor_ident.estimate import estimate
@@ -180,14 +180,10 @@ def test_how_sure_the_beat_is_of_its_period_is_how_it_scatters() -> None:
 def test_a_held_command_that_comes_in_bunches_is_put_back_on_its_beat(
     tmp_path: Path, held: int
 ) -> None:
-    number, n = "std_msgs/msg/Float64", 900
+    n = 900
     volts = np.repeat(np.random.default_rng(2).uniform(-6, 6, n // held + 1), held)[:n]
-    sent = [
-        Sent(topic, number, at, serialized(number, data=float(value)))
-        for k in range(n)
-        for at in [START + 30_000_000 * (k // 3 + 1)]
-        for topic, value in (("/pwm", volts[k]), ("/w", np.sin(0.1 * k)))
-    ]
+    at = START + 30_000_000 * (np.arange(n) // 3 + 1)
+    sent = in_order(floats("/pwm", at, volts), floats("/w", at, np.sin(0.1 * np.arange(n))))
     record = read(tmp_path / "bag.mcap", sent, ["voltage=/pwm.data velocity=/w.data"])
     assert len(record) > n - 5
     np.testing.assert_allclose(np.diff(record.time), 0.01, rtol=1e-3)

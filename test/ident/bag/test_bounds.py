@@ -3,18 +3,17 @@
 
 from __future__ import annotations
 
-import importlib.util
 import random
 import resource
 import subprocess
 import sys
 from pathlib import Path
-from types import ModuleType
 
 import lz4.frame
 import numpy as np
 import pytest
 from backports import zstd
+from bench_scripts import load
 from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 from recordings import assert_read, motion, write_mcap
@@ -23,18 +22,7 @@ from smp_motor_ident.bag import read_records
 from smp_motor_ident.errors import BagError
 
 ROOT = Path(__file__).resolve().parents[3]
-
-
-def _fuzz() -> ModuleType:
-    spec = importlib.util.spec_from_file_location("fuzz", ROOT / "benchmarks" / "fuzz.py")
-    assert spec is not None and spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules["fuzz"] = module
-    spec.loader.exec_module(module)
-    return module
-
-
-FUZZ = _fuzz()
+FUZZ = load("fuzz")
 
 
 @pytest.mark.parametrize("name", list(FUZZ.SEEDS))

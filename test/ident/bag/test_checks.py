@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from recordings import START, TYPES, Sent, read, serialized
+from recordings import START, TYPES, Sent, floats, in_order, read, serialized
 
 from smp_motor_ident.bag import read_records
 from smp_motor_ident.errors import BagError
@@ -203,16 +203,15 @@ def test_a_command_that_has_a_sign_needs_no_direction(tmp_path: Path, direction:
 def test_a_speed_command_mapped_as_a_voltage_is_told(
     tmp_path: Path, field: str, severity: str | None
 ) -> None:
-    number, twist = "std_msgs/msg/Float64", "geometry_msgs/msg/Twist"
-    vector = TYPES.types["geometry_msgs/msg/Vector3"]
-    topic, sent = field.split(".")[0], []
-    for k in range(200):
-        at, value = START + 10**7 * k, float(k // 20 % 3)
-        data = serialized(number, data=value)
-        if topic == "/cmd_vel":
-            data = serialized(twist, linear=vector(value, 0, 0), angular=vector(0, 0, 0))
-        sent.append(Sent(topic, twist if topic == "/cmd_vel" else number, at, data))
-        sent.append(Sent("/w", number, at, serialized(number, data=value)))
+    twist, vector = "geometry_msgs/msg/Twist", TYPES.types["geometry_msgs/msg/Vector3"]
+    topic, values = field.split(".")[0], np.arange(200) // 20 % 3
+    at = START + 10**7 * np.arange(200)
+    commands = floats(topic, at, values)
+    if topic == "/cmd_vel":
+        given = ((vector(v, 0, 0), vector(0, 0, 0)) for v in values.astype(float).tolist())
+        bodies = (serialized(twist, linear=v, angular=w) for v, w in given)
+        commands = [Sent(topic, twist, int(t), body) for t, body in zip(at, bodies)]
+    sent = in_order(commands, floats("/w", at, values))
     record = read(tmp_path / "bag.mcap", sent, [f"voltage={field} velocity=/w.data"])
     found = [f.severity for f in record.findings if f.code == "speed_command"]
     assert found == ([] if severity is None else [severity])

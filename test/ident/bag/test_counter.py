@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from recordings import COUNTS, RATIO, motion, read
+from recordings import COUNTS, RATIO, motion, notes, read
 
 from smp_motor_ident.bag import read_records
 from smp_motor_ident.bag.counter import Wrap, is_full, round_to_counts, unwrap, unwrap_angle
@@ -278,7 +278,7 @@ def test_a_reset_counter_begins_a_new_segment(tmp_path: Path) -> None:
     record = read_counts(tmp_path, count, 50)
     assert record.starts == (0, 120)
     assert np.all(np.diff(record.count)[np.arange(299) != 119] == 50)
-    assert "reset 1 times" in " ".join(f.message for f in record.findings)
+    assert "reset 1 times" in notes(record)
 
 
 def with_inertia(samples: int, most: float, seed: int) -> np.ndarray:

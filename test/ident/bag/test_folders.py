@@ -6,7 +6,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from recordings import assert_read, motion, write_mcap, write_metadata, write_sqlite
+from recordings import assert_read, motion, notes, write_mcap, write_metadata, write_sqlite
 
 from smp_motor_ident.bag import read_experiments, read_records
 from smp_motor_ident.errors import BagError
@@ -34,7 +34,7 @@ def test_split_bags_are_one_recording(bag: Path, storage: str, described: bool) 
     record = read_records(bag)["front_left"]
     assert_read(record, truth)
     assert record.starts == (0,)
-    assert ("metadata.yaml" in " ".join(f.message for f in record.findings)) is not described
+    assert ("metadata.yaml" in notes(record)) is not described
 
 
 def test_a_missing_part_of_a_split_bag_is_told_with_its_messages(bag: Path) -> None:
@@ -44,9 +44,8 @@ def test_a_missing_part_of_a_split_bag_is_told_with_its_messages(bag: Path) -> N
     write_metadata(bag, ["bag_0.mcap", "bag_1.mcap"], messages)
     record = read_records(bag)["front_left"]
     assert_read(record, truth, 100)
-    notes = " ".join(f.message for f in record.findings)
-    assert "bag_1.mcap is missing" in notes
-    assert "100 of 300 messages" in notes
+    assert "bag_1.mcap is missing" in notes(record)
+    assert "100 of 300 messages" in notes(record)
 
 
 def test_a_damaged_part_of_a_split_bag_costs_only_itself(bag: Path) -> None:
@@ -59,9 +58,8 @@ def test_a_damaged_part_of_a_split_bag_costs_only_itself(bag: Path) -> None:
     record = read_records(bag)["front_left"]
     assert len(record) == 200
     assert record.starts == (0, 100)
-    notes = " ".join(f.message for f in record.findings)
-    assert "bag_1.mcap: is empty" in notes
-    assert "200 of 300 messages" in notes
+    assert "bag_1.mcap: is empty" in notes(record)
+    assert "200 of 300 messages" in notes(record)
 
 
 def test_a_folder_of_bags_is_a_list_of_experiments(tmp_path: Path) -> None:
@@ -100,8 +98,7 @@ def test_fewer_messages_than_the_metadata_count_are_named(tmp_path: Path) -> Non
         storage="sqlite3",
         counts={"/front_left/motor_state": 1234},
     )
-    notes = " ".join(f.message for f in read_records(bag)["front_left"].findings)
-    assert "200 of 1234 messages could be read" in notes
+    assert "200 of 1234 messages could be read" in notes(read_records(bag)["front_left"])
 
 
 def test_a_path_that_does_not_exist_and_an_empty_folder_are_refused(tmp_path: Path) -> None:
@@ -118,8 +115,8 @@ def test_a_folder_of_bags_tells_which_of_them_could_not_be_read(tmp_path: Path) 
     (tmp_path / "bad" / "x_0.mcap").write_bytes(b"")
     records = read_experiments(tmp_path)["front_left"]
     assert [len(record) for record in records] == [20]
-    assert "not read:" in " ".join(f.message for f in records[0].findings)
-    assert "is empty" in " ".join(f.message for f in records[0].findings)
+    assert "not read:" in notes(records[0])
+    assert "is empty" in notes(records[0])
     with pytest.raises(BagError, match="is empty"):
         read_experiments([tmp_path / "good", tmp_path / "bad"])
 
@@ -131,4 +128,4 @@ def test_damaged_metadata_do_not_hide_the_files(tmp_path: Path, text: str) -> No
     (tmp_path / "metadata.yaml").write_text(text)
     record = read_records(tmp_path)["front_left"]
     assert_read(record, truth)
-    assert "metadata.yaml is damaged" in " ".join(f.message for f in record.findings)
+    assert "metadata.yaml is damaged" in notes(record)

@@ -23,6 +23,7 @@ from recordings import (
     header,
     merged,
     motion,
+    notes,
     serialized,
     write_mcap,
     write_metadata,
@@ -183,7 +184,7 @@ def test_messages_that_only_the_journal_holds_are_read(tmp_path: Path) -> None:
         gc.collect()
     assert not [str(one.message) for one in left if one.category is ResourceWarning]
     assert_read(record, truth)
-    assert "journal" in " ".join(f.message for f in record.findings)
+    assert "journal" in notes(record)
     assert (dead / "bag.db3").read_bytes() == before
 
 
@@ -282,6 +283,4 @@ def test_a_wheel_that_never_spoke_does_not_hide_the_others(tmp_path: Path) -> No
         database.execute("DELETE FROM messages WHERE topic_id = 4")
     records = read_records(path)
     assert set(records) == {"front_left"}
-    assert "not read: bag.db3: rear_left" in " ".join(
-        f.message for f in records["front_left"].findings
-    )
+    assert "not read: bag.db3: rear_left" in notes(records["front_left"])

@@ -9,7 +9,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 import scipy.io
-from recordings import START, TYPES, Sent, header, serialized, write_mcap
+from recordings import (
+    START,
+    TYPES,
+    Sent,
+    floats,
+    in_order,
+    joint_state,
+    serialized,
+    write_mcap,
+)
 
 from smp_motor_ident.bag import Listing, list_topics, read_records
 from smp_motor_ident.errors import BagError
@@ -37,27 +46,20 @@ def write(path: Path, **columns: Sequence[float]) -> Path:
 
 def test_a_bag_of_two_wheels_is_mapped_and_the_pwms_full_scale_asked_for(tmp_path: Path) -> None:
     (u, y), (v, z) = motor(1), motor(2)
-    number, joints = "std_msgs/msg/Float64", "sensor_msgs/msg/JointState"
-    twist = "geometry_msgs/msg/Twist"
-    vector = TYPES.types["geometry_msgs/msg/Vector3"]
-    sent = []
-    for k in range(N):
-        at = START + round(1e9 * T[k])
-        for topic, value in (("/left/pwm", u[k]), ("/right/pwm", v[k])):
-            data = serialized(number, data=float(round(value / 12 * 32767)))
-            sent.append(Sent(topic, number, at, data))
-        speeds = np.array([y[k], z[k]])
-        data = serialized(
-            joints,
-            header=header(at),
-            name=["left_wheel", "right_wheel"],
-            position=np.zeros(0),
-            velocity=speeds,
-            effort=np.zeros(0),
-        )
-        sent.append(Sent("/joint_states", joints, at, data))
-        data = serialized(twist, linear=vector(u[k], 0.0, 0.0), angular=vector(0.0, 0.0, 0.0))
-        sent.append(Sent("/cmd_vel", twist, at, data))
+    twist, vector = "geometry_msgs/msg/Twist", TYPES.types["geometry_msgs/msg/Vector3"]
+    at = START + np.rint(1e9 * T).astype(np.int64)
+    ticks = (
+        floats(t, at, np.rint(x / 12 * 32767)) for t, x in (("/left/pwm", u), ("/right/pwm", v))
+    )
+    sent = in_order(
+        *ticks,
+        [joint_state(t, ["left_wheel", "right_wheel"], both) for t, *both in zip(at, y, z)],
+        [
+            Sent("/cmd_vel", twist, int(t), serialized(twist, linear=vector(x, 0.0, 0.0),
+                                                       angular=vector(0.0, 0.0, 0.0)))
+            for t, x in zip(at, u.tolist())
+        ],
+    )  # fmt: skip
     listing = list_topics(write_mcap(tmp_path / "bag.mcap", sent))[0]
     assert listing.suggestion == [
         "left.voltage=/left/pwm.data:pwm",
@@ -361,18 +363,14 @@ def test_an_angle_that_starts_again_at_360_is_in_degrees(tmp_path: Path) -> None
 
 def robot(space: str, efforts: np.ndarray, seed: int, drive: str = "pwm") -> list[object]:
     """Return the messages of one wheel: joint states with an effort, and its command."""
-    number, joints = "std_msgs/msg/Float64", "sensor_msgs/msg/JointState"
     voltage, speed = motor(seed)
-    sent = []
-    for k in range(N):
-        at = START + round(1e9 * T[k])
-        data = serialized(number, data=float(np.rint(voltage[k] / 12 * 255)))
-        sent.append(Sent(f"{space}/{drive}", number, at, data))
-        joint = dict(name=["left_wheel"], position=np.zeros(0), velocity=speed[k : k + 1])
-        effort = efforts[k : k + 1]
-        data = serialized(joints, header=header(at), effort=effort, **joint)
-        sent.append(Sent(f"{space}/joint_states", joints, at, data))
-    return sent
+    at = START + np.rint(1e9 * T).astype(np.int64)
+    topic = f"{space}/joint_states"
+    states = [
+        joint_state(t, ["left_wheel"], speed[k : k + 1], effort=efforts[k : k + 1], topic=topic)
+        for k, t in enumerate(at)
+    ]
+    return in_order(floats(f"{space}/{drive}", at, np.rint(voltage / 12 * 255)), states)
 
 
 def efforts(kind: str, seed: int = 1) -> np.ndarray:

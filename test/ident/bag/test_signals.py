@@ -15,9 +15,12 @@ from recordings import (
     START,
     STATE,
     Sent,
+    floats,
     header,
+    in_order,
+    joint_state,
     motion,
-    serialized,
+    notes,
     write_mcap,
     write_sqlite,
 )
@@ -29,37 +32,17 @@ from smp_motor_ident.errors import BagError
 STEP = 10_000_000
 
 
-def floats(topic: str, values: Any, shift: int = 0) -> list[Any]:
-    return [
-        Sent(
-            topic,
-            "std_msgs/msg/Float64",
-            START + k * STEP + shift,
-            serialized("std_msgs/msg/Float64", data=float(value)),
-        )
-        for k, value in enumerate(values)
-    ]
+def even(topic: str, values: Any) -> list[Sent]:
+    return floats(topic, START + STEP * np.arange(len(values)), values)
 
 
-def joint_states(names: Any, velocities: Any, frames: Any = None) -> list[Any]:
+def joint_states(names: Any, velocities: Any, frames: Any = None) -> list[Sent]:
     """``names(k)`` are the joints of message k, ``velocities[k]`` their speeds."""
-    sent = []
-    for k, row in enumerate(velocities):
-        time = START + k * STEP
-        data = serialized(
-            "sensor_msgs/msg/JointState",
-            header=header(time, frames(k) if frames else ""),
-            name=names(k),
-            position=np.zeros(0),
-            velocity=np.array(row, float),
-            effort=np.zeros(0),
-        )
-        sent.append(Sent("/joint_states", "sensor_msgs/msg/JointState", time, data))
-    return sent
-
-
-def in_order(*parts: list[Any]) -> list[Any]:
-    return sorted((sent for part in parts for sent in part), key=lambda sent: sent.stamp)
+    times = [START + k * STEP for k in range(len(velocities))]
+    return [
+        joint_state(at, names(k), velocities[k], header=header(at, frames(k) if frames else ""))
+        for k, at in enumerate(times)
+    ]
 
 
 MAP = ["voltage=/pwm.data*12/255", "velocity=/joint_states.velocity[left_wheel_joint]"]
@@ -72,7 +55,7 @@ def test_pwm_counts_and_the_joint_of_a_name(tmp_path: Path, storage: str) -> Non
     pwm = rng.integers(-255, 256, n)
     speed = rng.normal(0, 1, (n, 2))
     messages = in_order(
-        floats("/pwm", pwm),
+        even("/pwm", pwm),
         joint_states(lambda _: ["right_wheel_joint", "left_wheel_joint"], speed),
     )
     write = write_mcap if storage == "mcap" else write_sqlite
@@ -98,7 +81,7 @@ def test_names_may_change_their_order_and_be_missing(tmp_path: Path) -> None:
     ]
     frames = ["", "a", "long frame"]
     messages = in_order(
-        floats("/pwm", pwm),
+        even("/pwm", pwm),
         joint_states(lambda k: orders[k % 3], rows, lambda k: frames[k % 2]),
     )
     record = read_records(write_mcap(tmp_path / "bag.mcap", messages), MAP)["motor"]
@@ -109,7 +92,7 @@ def test_a_topic_whose_every_message_is_laid_out_otherwise_is_read(tmp_path: Pat
     n = 150
     values = np.random.default_rng(2).normal(size=n)
     messages = in_order(
-        floats("/pwm", values),
+        even("/pwm", values),
         joint_states(
             lambda k: [
                 *(f"joint{j}" for j in range(k % 7)),
@@ -235,9 +218,9 @@ def test_a_duty_cycle_times_the_supply_as_it_was_measured(tmp_path: Path) -> Non
     duty = np.linspace(-1, 1, n)
     supply = np.linspace(12.6, 11.4, n)
     messages = in_order(
-        floats("/duty", duty),
-        floats("/battery", supply),
-        floats("/speed", np.zeros(n)),
+        even("/duty", duty),
+        even("/battery", supply),
+        even("/speed", np.zeros(n)),
     )
     path = write_mcap(tmp_path / "bag.mcap", messages)
     mapping = ["voltage=/duty.data:duty supply=/battery.data velocity=/speed.data"]
@@ -250,7 +233,7 @@ def test_a_duty_cycle_times_the_supply_as_it_was_measured(tmp_path: Path) -> Non
 
 
 def test_units_scales_and_shafts_come_out_in_si_at_the_motor(tmp_path: Path) -> None:
-    messages = in_order(floats("/u", [1.0] * 9), floats("/w", [60.0] * 9))
+    messages = in_order(even("/u", [1.0] * 9), even("/w", [60.0] * 9))
     path = write_mcap(tmp_path / "bag.mcap", messages)
 
     def speed(spec: str) -> float:
@@ -285,7 +268,7 @@ def test_units_scales_and_shafts_come_out_in_si_at_the_motor(tmp_path: Path) -> 
 def test_a_mapping_that_does_not_fit_is_refused_with_the_available_fields(
     tmp_path: Path, mapping: str, reason: str
 ) -> None:
-    messages = in_order(floats("/u", [1.0] * 9), floats("/w", [60.0] * 9))
+    messages = in_order(even("/u", [1.0] * 9), even("/w", [60.0] * 9))
     path = write_mcap(tmp_path / "bag.mcap", messages)
     with pytest.raises(BagError) as refused:
         read_records(path, mapping)
@@ -300,17 +283,15 @@ def test_messages_that_are_not_of_their_type_are_left_out_and_told(tmp_path: Pat
     messages[70] = Sent(messages[70].topic, STATE, messages[70].stamp, b"")
     record = read_records(write_mcap(tmp_path / "bag.mcap", messages))["front_left"]
     assert len(record) == 98
-    assert "2 messages are not of type smp_interfaces/msg/MotorState" in " ".join(
-        f.message for f in record.findings
-    )
+    assert "2 messages are not of type smp_interfaces/msg/MotorState" in notes(record)
 
 
 def test_the_topics_of_a_bag_are_listed(tmp_path: Path) -> None:
     n = 30
     messages = in_order(
-        floats("/left/pwm", np.arange(n)),
-        floats("/right/pwm", np.arange(n)),
-        floats("/temperature", np.arange(n)),
+        even("/left/pwm", np.arange(n)),
+        even("/right/pwm", np.arange(n)),
+        even("/temperature", np.arange(n)),
         joint_states(lambda _: ["left_wheel", "right_wheel"], [[1.0, 2.0]] * n),
     )
     path = write_mcap(tmp_path / "bag.mcap", messages)
@@ -339,6 +320,4 @@ def test_our_own_messages_need_no_mapping(tmp_path: Path) -> None:
 def test_a_missing_description_is_told(tmp_path: Path) -> None:
     messages = motion(n=20).messages(description=False)
     record = read_records(write_mcap(tmp_path / "bag.mcap", messages))["front_left"]
-    assert "no motor_description; a gear ratio of 1 is assumed" in " ".join(
-        f.message for f in record.findings
-    )
+    assert "no motor_description; a gear ratio of 1 is assumed" in notes(record)

@@ -14,12 +14,13 @@ from hypothesis import strategies as st
 from recordings import (
     START,
     Motion,
-    Sent,
     assert_read,
-    header,
+    floats,
+    in_order,
+    joint_state,
     motion,
+    notes,
     read,
-    serialized,
     write_mcap,
     write_sqlite,
 )
@@ -81,7 +82,7 @@ def test_shuffled_samples_are_sorted_and_that_is_told(
     record = read_records(path)["front_left"]
     assert_read(record, truth)
     shuffled = list(order) != sorted(order)
-    assert ("out of order" in " ".join(f.message for f in record.findings)) is shuffled
+    assert ("out of order" in notes(record)) is shuffled
 
 
 def test_a_mean_voltage_over_a_long_interval_of_irregular_samples_begins_a_segment(
@@ -94,7 +95,7 @@ def test_a_mean_voltage_over_a_long_interval_of_irregular_samples_begins_a_segme
     truth = replaced(truth, time=START + np.cumsum(steps))
     record = read(tmp_path / "bag.mcap", truth.messages())
     assert record.starts == (0, 120)
-    assert "1 gaps of up to 0.4 s" in " ".join(f.message for f in record.findings)
+    assert "1 gaps of up to 0.4 s" in notes(record)
 
 
 def test_a_few_lost_samples_are_bridged_and_more_begin_a_segment(tmp_path: Path) -> None:
@@ -108,9 +109,8 @@ def test_a_few_lost_samples_are_bridged_and_more_begin_a_segment(tmp_path: Path)
     record = read(tmp_path / "bag.mcap", some)
     assert len(record) == kept.size
     assert [int(kept[s]) for s in record.starts] == [0, 205, 350]
-    notes = " ".join(f.message for f in record.findings)
-    assert "3 samples missing in 2 places" in notes
-    assert "2 gaps of up to 0.51 s (55 samples missing)" in notes
+    assert "3 samples missing in 2 places" in notes(record)
+    assert "2 gaps of up to 0.51 s (55 samples missing)" in notes(record)
     # The mean of a ramp over two and three intervals; only the last was recorded.
     step = ramp[1] - ramp[0]
     index = list(kept)
@@ -130,7 +130,7 @@ def test_late_samples_are_not_taken_for_lost_ones(tmp_path: Path) -> None:
     record = read(tmp_path / "bag.mcap", truth.messages())
     assert_read(record, truth)
     assert record.starts == (0,)
-    assert "missing" not in " ".join(f.message for f in record.findings)
+    assert "missing" not in notes(record)
 
 
 def test_duplicates_are_left_out_and_told(tmp_path: Path) -> None:
@@ -138,9 +138,7 @@ def test_duplicates_are_left_out_and_told(tmp_path: Path) -> None:
     messages = truth.messages()
     record = read(tmp_path / "bag.mcap", [*messages, *messages[40:60]])
     assert_read(record, truth)
-    assert "20 samples with a repeated time were left out (duplicates)" in " ".join(
-        [f.message for f in record.findings]
-    )
+    assert "20 samples with a repeated time were left out (duplicates)" in notes(record)
 
 
 def test_samples_without_a_voltage_are_left_out_and_told(tmp_path: Path) -> None:
@@ -154,9 +152,8 @@ def test_samples_without_a_voltage_are_left_out_and_told(tmp_path: Path) -> None
     assert len(record) == 98
     assert record.current is None
     assert np.isnan(record.velocity).sum() == 1
-    notes = " ".join(f.message for f in record.findings)
-    assert "2 samples without a finite voltage were left out" in notes
-    assert "velocity: 1 values missing" in notes
+    assert "2 samples without a finite voltage were left out" in notes(record)
+    assert "velocity: 1 values missing" in notes(record)
 
 
 @pytest.mark.parametrize("days", [0, 3, -3])
@@ -166,9 +163,8 @@ def test_header_stamps_days_away_from_the_log_are_used_and_that_is_told(
     truth = motion(n=100)
     record = read(tmp_path / "bag.mcap", truth.messages(latency=days * 86_400 * 10**9 + 7))
     assert_read(record, truth)
-    notes = " ".join(f.message for f in record.findings)
-    assert "time: header stamps" in notes
-    assert (f"{days * 86400:+d}.000000 s from the header's" in notes) is bool(days)
+    assert "time: header stamps" in notes(record)
+    assert (f"{days * 86400:+d}.000000 s from the header's" in notes(record)) is bool(days)
 
 
 def test_stamps_that_are_not_set_are_not_the_time(tmp_path: Path) -> None:
@@ -180,9 +176,7 @@ def test_stamps_that_are_not_set_are_not_the_time(tmp_path: Path) -> None:
     ]
     record = read(tmp_path / "bag.mcap", [*truth.messages()[:1], *messages])
     assert_read(record, truth)
-    assert "time: log times (the header stamps are not set)" in " ".join(
-        f.message for f in record.findings
-    )
+    assert "time: log times (the header stamps are not set)" in notes(record)
 
 
 def test_a_clock_that_was_set_back_begins_a_new_segment(tmp_path: Path) -> None:
@@ -196,14 +190,7 @@ def test_a_clock_that_was_set_back_begins_a_new_segment(tmp_path: Path) -> None:
     record = read(tmp_path / "bag.mcap", [*truth.messages()[:1], *messages])
     assert record.starts == (0, 100)
     np.testing.assert_array_equal(record.voltage, truth.voltage)
-    assert "set back 1 times" in " ".join(f.message for f in record.findings)
-
-
-def floats(topic: str, times: Any, values: Any) -> list[Any]:
-    kind = "std_msgs/msg/Float64"
-    return [
-        Sent(topic, kind, int(t), serialized(kind, data=float(v))) for t, v in zip(times, values)
-    ]
+    assert "set back 1 times" in notes(record)
 
 
 def test_a_stamped_output_meets_an_unstamped_input_by_offset_and_drift(tmp_path: Path) -> None:
@@ -212,26 +199,20 @@ def test_a_stamped_output_meets_an_unstamped_input_by_offset_and_drift(tmp_path:
     sampled = np.arange(n) * 0.01  # the microcontroller's clock
     on_log = sampled * (1 + drift) + offset
     latency = 0.0002 + rng.exponential(0.0005, n)
-    messages = []
-    for k in range(n):
-        data = serialized(
-            "sensor_msgs/msg/JointState",
-            header=header(START + round(sampled[k] * 1e9), ""),
-            name=["w"],
-            position=np.zeros(0),
-            velocity=np.array([on_log[k]]),
-            effort=np.zeros(0),
+    messages = [
+        joint_state(
+            START + round((on_log[k] + latency[k]) * 1e9), ["w"], [on_log[k]], topic="/js",
+            stamp=START + round(sampled[k] * 1e9),
         )
-        stamp = START + round((on_log[k] + latency[k]) * 1e9)
-        messages.append(Sent("/js", "sensor_msgs/msg/JointState", stamp, data))
+        for k in range(n)
+    ]  # fmt: skip
     # The input is its own time, so that an error of alignment is an error of voltage.
     input_times = np.arange(n // 2) * 0.02 + offset
     stamps = START + np.rint(input_times * 1e9).astype(np.int64)
-    messages = sorted(messages + floats("/u", stamps, input_times), key=lambda s: s.stamp)
+    messages = in_order(messages, floats("/u", stamps, input_times))
     record = read(tmp_path / "bag.mcap", messages, "voltage=/u.data velocity=/js.velocity[w]")
-    notes = " ".join(f.message for f in record.findings)
-    assert "offset and drift" in notes
-    assert "drifting by +50 ppm" in notes
+    assert "offset and drift" in notes(record)
+    assert "drifting by +50 ppm" in notes(record)
     # Mean of the held value over the interval: at most one input period old, never in the future
     lag = record.velocity - record.voltage
     assert lag.min() >= 0.0
@@ -275,38 +256,28 @@ def test_a_held_input_is_averaged_over_each_interval(data: st.DataObject, held: 
 
 def test_samples_before_the_first_command_are_left_out(tmp_path: Path) -> None:
     times = START + np.arange(100) * 10_000_000
-    messages = sorted(
-        floats("/w", times, np.arange(100)) + floats("/u", times[30:], np.ones(70)),
-        key=lambda sent: sent.stamp,
-    )
+    messages = in_order(floats("/w", times, np.arange(100)), floats("/u", times[30:], np.ones(70)))
     record = read(tmp_path / "bag.mcap", messages, "voltage=/u.data velocity=/w.data")
     assert len(record) == 70
-    assert "30 samples before the first voltage were left out" in " ".join(
-        f.message for f in record.findings
-    )
+    assert "30 samples before the first voltage were left out" in notes(record)
 
 
 def test_an_input_that_stops_ends_the_record_there(tmp_path: Path) -> None:
     times = START + np.arange(200) * 10_000_000
     on = np.r_[0:60, 140:200]
-    messages = sorted(
-        floats("/w", times, np.arange(200)) + floats("/u", times[on], np.ones(120)),
-        key=lambda sent: sent.stamp,
-    )
+    messages = in_order(floats("/w", times, np.arange(200)), floats("/u", times[on], np.ones(120)))
     record = read(tmp_path / "bag.mcap", messages, "voltage=/u.data velocity=/w.data")
-    notes = " ".join(f.message for f in record.findings)
-    assert "no voltage came for more than 0.2 s" in notes
+    assert "no voltage came for more than 0.2 s" in notes(record)
     assert len(record.starts) == 2
 
 
 def test_outputs_of_several_topics_come_onto_one_axis(tmp_path: Path) -> None:
     fast = START + np.arange(400) * 5_000_000
     slow = START + np.arange(200) * 10_000_000 + 1_000_000
-    messages = sorted(
-        floats("/u", slow, np.ones(200))
-        + floats("/pos", slow, np.arange(200) * 0.01)
-        + floats("/w", fast, np.arange(400) * 0.5),
-        key=lambda sent: sent.stamp,
+    messages = in_order(
+        floats("/u", slow, np.ones(200)),
+        floats("/pos", slow, np.arange(200) * 0.01),
+        floats("/w", fast, np.arange(400) * 0.5),
     )
     record = read(
         tmp_path / "bag.mcap",
@@ -316,19 +287,16 @@ def test_outputs_of_several_topics_come_onto_one_axis(tmp_path: Path) -> None:
     assert record.sample_time == pytest.approx(0.01)
     # A straight line is interpolated exactly, but for rounding.
     np.testing.assert_allclose(record.velocity, (record.time + 0.001) * 100, rtol=1e-9)
-    assert "velocity: interpolated" in " ".join(f.message for f in record.findings)
+    assert "velocity: interpolated" in notes(record)
 
 
 def test_an_angle_that_wraps_at_a_turn_is_unwrapped(tmp_path: Path) -> None:
     times = START + np.arange(300) * 10_000_000
     angle = np.arange(300) * 7.0
-    messages = sorted(
-        floats("/u", times, np.ones(300)) + floats("/angle", times, angle % 360),
-        key=lambda sent: sent.stamp,
-    )
+    messages = in_order(floats("/u", times, np.ones(300)), floats("/angle", times, angle % 360))
     record = read(tmp_path / "bag.mcap", messages, "voltage=/u.data position=/angle.data:deg")
     np.testing.assert_allclose(np.diff(record.position), np.deg2rad(7.0), rtol=1e-9)
-    assert "wraps at one turn" in " ".join(f.message for f in record.findings)
+    assert "wraps at one turn" in notes(record)
 
 
 def test_recordings_of_different_gearboxes_are_not_joined(tmp_path: Path) -> None:
@@ -376,13 +344,9 @@ def test_a_clock_that_is_set_forward_begins_a_segment_and_costs_no_time(
 
 
 def test_offsets_between_topics_are_kept_where_the_clock_is_set(tmp_path: Path) -> None:
-    number, leap = "std_msgs/msg/Float64", 10**18
-    sent = [
-        Sent(topic, number, at, serialized(number, data=float(value)))
-        for k in range(400)
-        for at in [START + 10**7 * k + leap * (k >= 200)]
-        for topic, value in (("/u", k // 20 % 3), ("/w", np.sin(0.1 * k)))
-    ]
+    k, leap = np.arange(400), 10**18
+    at = START + 10**7 * k + leap * (k >= 200)
+    sent = in_order(floats("/u", at, k // 20 % 3), floats("/w", at, np.sin(0.1 * k)))
     record = read(tmp_path / "bag.mcap", sent, ["voltage=/u.data velocity=/w.data"])
     assert record.starts == (0, 200)
     np.testing.assert_allclose(record.velocity, np.sin(0.1 * np.arange(400)))

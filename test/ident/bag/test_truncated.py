@@ -11,7 +11,7 @@ import mcap.writer
 import numpy as np
 import pytest
 from backports import zstd
-from recordings import assert_read, motion, write_mcap, write_metadata, write_sqlite
+from recordings import assert_read, motion, notes, write_mcap, write_metadata, write_sqlite
 
 from smp_motor_ident.bag import BagWriter, read_records
 from smp_motor_ident.errors import BagError
@@ -27,7 +27,7 @@ def samples_and_words(path: Path) -> tuple[int, str]:
     except BagError as error:
         count, words = 0, str(error)
     else:
-        return len(record), " ".join(f.message for f in record.findings)
+        return len(record), notes(record)
     assert "\n" not in words
     assert path.name in words or path.parent.name in words
     return count, words
