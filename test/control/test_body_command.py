@@ -8,7 +8,6 @@ import math
 import pytest
 
 from smp_motor_control.body.command import BodyCommand, Verdict
-from smp_motor_control.errors import ParameterError
 
 
 def test_nothing_is_asked_before_the_first_command_even_if_that_is_nan() -> None:
@@ -74,9 +73,3 @@ def test_reset_forgets_the_command() -> None:
     command.receive(1.0, 0.5, 0.0, 10.0)
     command.reset()
     assert command.at(10.0) is None
-
-
-@pytest.mark.parametrize("timeout", [-0.1, math.nan, math.inf])
-def test_impossible_timeout_is_refused(timeout: float) -> None:
-    with pytest.raises(ParameterError, match="timeout"):
-        BodyCommand(timeout)

@@ -3,12 +3,9 @@
 
 from __future__ import annotations
 
-import math
-
 import pytest
 
 from smp_motor_control import WHEELS
-from smp_motor_control.errors import ParameterError
 from smp_motor_control.keyboard import BODY_KEYS, Keyboard, Speeds, parse_keys
 
 SPEEDS = Speeds(linear=0.2, angular=0.6, wheel=1.5, step=0.1, timeout=0.6)
@@ -91,10 +88,3 @@ def test_speed_steps_are_bounded_and_undo_each_other() -> None:
 )
 def test_characters_are_taken_for_the_keys_that_send_them(text: str, keys: list) -> None:
     assert parse_keys(text) == keys
-
-
-@pytest.mark.parametrize("name", ["linear", "angular", "wheel", "step", "timeout"])
-@pytest.mark.parametrize("value", [0.0, -1.0, math.nan, math.inf])
-def test_impossible_speed_is_refused_by_name(name: str, value: float) -> None:
-    with pytest.raises(ParameterError, match=name):
-        Speeds(**{name: value})

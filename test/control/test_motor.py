@@ -166,31 +166,6 @@ def test_motor_made_of_combinations_answers_a_voltage_like_the_original():
             assert two.speed == pytest.approx(one.speed, abs=1e-9)
 
 
-@pytest.mark.parametrize(
-    ("name", "value"),
-    [
-        ("inertia", -1e-6),
-        ("inertia", 0.0),
-        ("resistance", 0.0),
-        ("motor_constant", math.nan),
-        ("inductance", -1.0),
-        ("coulomb_friction", math.inf),
-        ("viscous_friction", "much"),
-        ("resistance", True),
-    ],
-)
-def test_impossible_parameter_is_refused_by_name(name, value):
-    good = {
-        "resistance": 1.0,
-        "inductance": 0.1,
-        "motor_constant": 0.1,
-        "inertia": 1e-5,
-        "viscous_friction": 0.0,
-    }
-    with pytest.raises(ParameterError, match=name):
-        MotorParameters(**{**good, name: value})
-
-
 @pytest.mark.parametrize("bad", [(math.nan, 0.01, 0.0), (1.0, -0.01, 0.0), (1.0, 0.01, math.inf)])
 def test_step_with_nonsense_is_refused_and_leaves_the_motor_as_it_was(bad):
     motor = Motor(paper_motor("front_left"), speed=3.0)

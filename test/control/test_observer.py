@@ -248,21 +248,6 @@ def test_long_gap_begins_again_from_the_counts() -> None:
     assert observer.speed == pytest.approx(motor.speed, abs=1.5)
 
 
-@pytest.mark.parametrize("name", ["load", "voltage", "count"])
-@pytest.mark.parametrize("value", [0.0, -1.0, math.nan, math.inf])
-def test_impossible_noise_is_refused_by_name(name: str, value: float) -> None:
-    with pytest.raises(ParameterError, match=name):
-        ObserverNoise(**{name: value})
-
-
-@pytest.mark.parametrize("name", ["dc_gain", "time_constant", "static_voltage", "delay"])
-@pytest.mark.parametrize("value", [-1.0, math.nan, math.inf])
-def test_impossible_model_is_refused_by_name(name: str, value: float) -> None:
-    numbers = {"dc_gain": 25.0, "time_constant": 0.05, name: value}
-    with pytest.raises(ParameterError, match=name):
-        MotorModel(**numbers)
-
-
 @pytest.mark.parametrize("electrical", [2e-4, 1e-3, 1e-2])
 def test_gain_is_that_of_the_recursion_run_in_fine_steps(electrical: float) -> None:
     # The covariance carried step by step through fiftieths of L/R, in which the exponential of

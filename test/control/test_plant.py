@@ -143,13 +143,6 @@ def test_load_at_the_wheel_slows_it_as_the_motor_equation_predicts():
     assert not plant.load(20.0, math.nan)
 
 
-def test_settings_out_of_range_are_refused():
-    with pytest.raises(ParameterError, match="pwm_steps"):
-        DriveSettings(pwm_steps=-1)
-    with pytest.raises(ParameterError, match="current_noise"):
-        DriveSettings(current_noise=math.nan)
-
-
 def test_a_latched_command_waits_for_the_next_sample():
     plant = DrivenMotor(ENTRY, DriveSettings(latch=True))
     plant.sample(0.01)

@@ -47,16 +47,6 @@ def test_radius_multipliers_act_on_their_side() -> None:
     assert robot.wheel_speeds(1.0, 0.0) == pytest.approx((20.0, 5.0))
 
 
-@pytest.mark.parametrize(
-    "name", ["wheel_separation", "wheel_radius", "wheel_separation_multiplier", "max_wheel_speed"]
-)
-@pytest.mark.parametrize("value", [0.0, -1.0, math.nan])
-def test_impossible_geometry_is_refused_by_name(name: str, value: float) -> None:
-    geometry = {"wheel_separation": 0.4, "wheel_radius": 0.1, name: value}
-    with pytest.raises(ParameterError, match=name):
-        SkidSteer(**geometry)
-
-
 def test_sides_hold_the_wheels_of_the_contract() -> None:
     assert LEFT == ("front_left", "rear_left")
     assert RIGHT == ("front_right", "rear_right")

@@ -85,19 +85,3 @@ def test_a_wheel_that_is_too_fast_or_is_not_heard_ends_the_signal(process, robot
     plant.send_signal(signal.SIGKILL)
     eventually(lambda: excite.returncode is not None, 20.0, robot.spin, excite.output)
     assert excite.returncode == 1 and "rear_left: no motor_state for 1 s" in excite.output
-
-
-@pytest.mark.parametrize(
-    ("given", "words"),
-    [
-        ("amplitude:=20.0", "must not exceed max_voltage"),
-        ("signal:=noise", "known are sine"),
-        ("wheels:=[left] wait:=0.2", "no subscriber on /left/motor_command"),
-        ("duration:=-1.0", "duration is -1.0"),
-    ],
-)
-def test_excite_refuses_in_one_line(process, given, words):
-    parameters = [part for one in given.split() for part in ("-p", one)]
-    excite = process("excite", "--ros-args", *parameters)
-    assert excite.wait(15.0) == 2
-    assert words in excite.output and len(excite.output.strip().splitlines()) == 1

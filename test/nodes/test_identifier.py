@@ -45,10 +45,3 @@ def test_it_demands_motion_before_it_names_a_number_and_then_names_the_right_one
 
     identifier.send_signal(signal.SIGINT)
     assert identifier.wait(5.0) == 0
-
-
-def test_a_window_that_cannot_meet_its_demands_is_refused_in_one_line(process):
-    node = process("identifier", "--ros-args", "-p", "window:=3.0")
-    assert node.wait(30.0) == 2
-    (line,) = node.output.strip().splitlines()
-    assert "demands.duration" in line

@@ -111,14 +111,3 @@ def test_wheel_obeys_one_writer_until_that_one_rests(process, robot, eventually)
     command(first=0.0, second=-6.0)
     assert owners[-1] == "second" and front[-1].voltage == pytest.approx(-6.0, abs=0.013)
     eventually(lambda: owners[-1] == "", 3.0, robot.spin, "the lease does not end")
-
-
-def test_bad_parameter_and_unreadable_file_end_the_plant_with_one_line(process):
-    for given, words in (
-        (["-p", "rate:=fast"], "rate is 'fast'"),
-        (["-p", "motors_file:=/nowhere.yaml"], "/nowhere.yaml: cannot be read"),
-        (["--params-file", "/nowhere.yaml"], "/nowhere.yaml"),
-    ):
-        plant = process("motor_plant", "--ros-args", *given)
-        assert plant.wait(15.0) == 2
-        assert words in plant.output and len(plant.output.strip().splitlines()) == 1

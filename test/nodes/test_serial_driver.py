@@ -112,13 +112,17 @@ def board(tmp_path: Path) -> Iterator[Firmware]:
     firmware.join()
 
 
+@pytest.fixture
+def driver(board: Firmware, process: Callable[..., Any]) -> Callable[..., Any]:
+    """Start a driver of the board's two wheels: ``driver("-p", "encoder_bits:=16")``."""
+    given = options(f"device:={board.device}", "wheel_names:=[left, right]")
+    return lambda *more: process("serial_driver", *given, *more)
+
+
 def test_it_drives_through_lost_bytes_resets_and_unplugging(
-    board: Firmware, node: Node, process: Callable[..., Any], eventually: Callable[..., None]
+    board: Firmware, node: Node, driver: Callable[..., Any], eventually: Callable[..., None]
 ) -> None:
-    wheels = "wheel_names:=[left, right]"
-    driver = process(
-        "serial_driver", *options(f"device:={board.device}", wheels, "encoder_bits:=16")
-    )
+    started = driver("-p", "encoder_bits:=16")
     seen: list[MotorState] = []
     node.create_subscription(MotorState, "left/motor_state", seen.append, 10)
     command = node.create_publisher(MotorCommand, "left/motor_command", 10)
@@ -132,14 +136,14 @@ def test_it_drives_through_lost_bytes_resets_and_unplugging(
         # One count in a period is 1.3 rad/s of 60; the mean of 20 leaves less than a percent.
         return len(last) == 20 and abs(sum(last) / 20 - 3.0 * GAIN) < 0.02 * 3.0 * GAIN
 
-    eventually(turning, 20.0, drive, driver.output)
+    eventually(turning, 20.0, drive, started.output)
     assert seen[-1].current == pytest.approx(0.25)
     assert seen[-1].header.frame_id == "left_wheel_joint"
 
     def settles_after(trouble: Callable[[], None]) -> None:
         trouble()
         begun = len(seen)
-        eventually(lambda: len(seen) > begun + 30 and turning(), 20.0, drive, driver.output)
+        eventually(lambda: len(seen) > begun + 30 and turning(), 20.0, drive, started.output)
         # Whatever was lost, no sample says that the wheel turned otherwise than it did.
         assert max(abs(m.velocity) for m in seen[begun:]) < 1.5 * 3.0 * GAIN
 
@@ -183,12 +187,10 @@ def robot(node: Node) -> Any:
 # 36 V in 16 bits are -29536 mV; a divider may show anything.
 @pytest.mark.parametrize("battery", [-12000, -29536, -1, 65535, 10**17, 0, 40, ""])
 def test_no_supply_that_a_board_reports_turns_zero_into_motion(
-    board: Firmware, robot: Any, process: Any, eventually: Any, battery: int | str
+    board: Firmware, robot: Any, driver: Any, eventually: Any, battery: int | str
 ) -> None:
     board.battery = battery
-    started = process(
-        "serial_driver", *options(f"device:={board.device}", "wheel_names:=[left, right]")
-    )
+    started = driver()
     eventually(lambda: len(board.obeyed) > 30, 20.0, robot.drive, started.output)
     assert board.obeyed == [[0.0, 0.0]] * len(board.obeyed)
     robot.voltage = -3.0
@@ -201,11 +203,9 @@ def test_no_supply_that_a_board_reports_turns_zero_into_motion(
 
 
 def test_a_suspended_board_gets_few_outdated_commands(
-    board: Firmware, robot: Any, process: Any, eventually: Any
+    board: Firmware, robot: Any, driver: Any, eventually: Any
 ) -> None:
-    started = process(
-        "serial_driver", *options(f"device:={board.device}", "wheel_names:=[left, right]")
-    )
+    started = driver()
     robot.voltage = 3.0
     eventually(lambda: board.voltages == [3.0, 3.0], 20.0, robot.drive, started.output)
     board.stalled, begun = True, time.monotonic()
@@ -223,7 +223,7 @@ def test_a_suspended_board_gets_few_outdated_commands(
 
 
 def test_every_command_follows_the_clock_of_the_sample_that_it_answers(
-    board: Firmware, robot: Any, process: Any, eventually: Any
+    board: Firmware, robot: Any, driver: Any, eventually: Any
 ) -> None:
     told: list[tuple[int, float]] = []
 
@@ -236,7 +236,7 @@ def test_every_command_follows_the_clock_of_the_sample_that_it_answers(
                 board.obeyed.append(board.voltages)
 
     board.listen = listen  # type: ignore[method-assign]
-    process("serial_driver", *options(f"device:={board.device}", "wheel_names:=[left, right]"))
+    driver()
     eventually(lambda: len(told) > 50, 20.0, robot.drive)
     assert abs(len(told) - len(board.obeyed)) <= 1
     ages = sorted(1e-6 * (clock - answered) for answered, clock in told)
@@ -244,11 +244,9 @@ def test_every_command_follows_the_clock_of_the_sample_that_it_answers(
 
 
 def test_lines_that_no_board_sends_end_nothing(
-    board: Firmware, robot: Any, process: Any, eventually: Any
+    board: Firmware, robot: Any, driver: Any, eventually: Any
 ) -> None:
-    started = process(
-        "serial_driver", *options(f"device:={board.device}", "wheel_names:=[left, right]")
-    )
+    started = driver()
     eventually(lambda: len(robot.seen) > 5, 20.0, robot.drive, started.output)
     long = "9" * 400
     for fields in (
@@ -278,12 +276,11 @@ def test_a_device_that_is_not_a_terminal_is_named_and_closed(
 
 
 def test_a_device_that_another_program_has_is_left_alone(
-    board: Firmware, robot: Any, process: Any, eventually: Any
+    board: Firmware, robot: Any, driver: Any, eventually: Any
 ) -> None:
-    given = options(f"device:={board.device}", "wheel_names:=[left, right]")
-    process("serial_driver", *given)
+    driver()
     eventually(lambda: len(robot.seen) > 5, 20.0, robot.drive)
-    process("serial_driver", *given, "-r", "__ns:=/second")
+    driver("-r", "__ns:=/second")
     eventually(
         lambda: any("another program has it open" in m for m in robot.diagnoses),
         20.0, robot.drive, robot.diagnoses,
@@ -310,14 +307,6 @@ def test_a_device_that_another_program_has_is_left_alone(
 def test_options_that_no_board_has_are_refused(given: dict[str, Any], words: str) -> None:
     with pytest.raises(ParameterError, match=words):
         Settings(**given)
-
-
-@pytest.mark.parametrize("given", ["wheel_names:=[left, left]", "supply_voltage:=-12.0"])
-def test_refused_options_are_one_line(process: Any, given: str) -> None:
-    started = process("serial_driver", *options(given))
-    assert started.wait(20.0) == 2
-    (line,) = started.output.strip().splitlines()
-    assert line.startswith("serial_driver: ")
 
 
 def test_a_line_that_was_spoilt_is_never_taken() -> None:

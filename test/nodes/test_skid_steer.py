@@ -215,23 +215,6 @@ def test_wheels_are_left_at_zero_on_exit(skid_steer, peer, eventually, end: str)
 
 
 @pytest.mark.parametrize(
-    ("arguments", "named"),
-    [
-        (["-p", "wheel_radius:=-0.1"], "wheel_radius"),
-        (["-p", "angular.z.max_velocity:=1.0", "-p", "angular.z.min_velocity:=2.0"], "angular.z"),
-        (["-p", "use_stamped_vel:=3"], "use_stamped_vel"),
-        (["-p", "left_wheel_names:=[a, front_right]"], "named twice"),
-    ],
-)
-def test_wrong_parameters_end_it_with_one_line(process, arguments: list, named: str) -> None:
-    started = process("skid_steer", "--ros-args", *arguments)
-    assert started.wait(15.0) == 2
-    lines = [line for line in started.output.splitlines() if line.strip()]
-    assert len(lines) == 1
-    assert named in lines[0]
-
-
-@pytest.mark.parametrize(
     "row", next(case["table"] for case in BEHAVIOUR if case["id"] == "frame_prefix"), ids=str
 )
 def test_frames_are_prefixed_as_by_diff_drive_controller(row: dict) -> None:

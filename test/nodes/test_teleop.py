@@ -231,13 +231,6 @@ def test_exception_in_the_node_restores_the_terminal(terminal, eventually) -> No
     eventually(lambda: "broken" in shell.shown)
 
 
-def test_without_a_terminal_it_says_so_in_one_line(process) -> None:
-    started = process("teleop_wheels")
-    assert started.wait(15.0) == 2
-    assert started.output.count("\n") == 1
-    assert "not a terminal" in started.output
-
-
 def test_impossible_speed_is_refused_and_the_terminal_left_alone(terminal, eventually) -> None:
     shell = terminal("teleop_wheels", "--ros-args", "-p", "linear_speed:=-1.0")
     eventually(lambda: shell.process.poll() is not None, deadline=20.0)

@@ -229,17 +229,6 @@ def test_stall_runaway_and_over_current_switch_the_motor_off(start, robot, event
         )
 
 
-def test_wheel_without_a_name_and_parameters_that_make_no_sense_are_refused(process):
-    for given, words in (
-        ([], "joint_name is empty"),
-        (["-p", "i:=-100.0", "-r", "__ns:=/front_left"], "i is -100; it must be in [0,"),
-        (["-p", "i_clamp_max:=-1.0", "-r", "__ns:=/front_left"], "i_clamp_m"),
-    ):
-        node = process("wheel_pid", "--ros-args", *given)
-        assert node.wait(15.0) == 2
-        assert words in node.output and len(node.output.strip().splitlines()) == 1
-
-
 def test_unknown_parameter_and_missing_gains_are_warned_of(start, eventually):
     node = start("max_velocty:=1.0")
     eventually(lambda: "default gains: p is 1 V s/rad" in node.output, 5.0)

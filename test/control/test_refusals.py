@@ -1,0 +1,95 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Numbers that no robot has are refused by their name, wherever they are given."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+
+import pytest
+
+from smp_motor_control.body.command import BodyCommand
+from smp_motor_control.body.kinematics import SkidSteer
+from smp_motor_control.body.odometry import Odometry
+from smp_motor_control.encoder import Encoder
+from smp_motor_control.errors import ParameterError
+from smp_motor_control.keyboard import Speeds
+from smp_motor_control.motor import MotorParameters
+from smp_motor_control.motor.hardware import DriveSettings
+from smp_motor_control.motor.model import MotorModel
+from smp_motor_control.observer import ObserverNoise
+from smp_motor_control.pid import PidGains
+from smp_motor_control.reference.profile import ProfileLimits
+from smp_motor_control.wheel.faults import FaultLimits
+from smp_motor_control.wheel.loop import LoopSettings
+
+NAN, INF = math.nan, math.inf
+MOTOR = dict(resistance=1.0, inductance=0.1, motor_constant=0.1, inertia=1e-5, viscous_friction=0.0)
+AXLE = dict(wheel_separation=0.5, left_radius=0.1, right_radius=0.125)
+TABLE = [
+    # what is made, its other numbers, names, and values that each of them refuses
+    (MotorParameters, MOTOR, "resistance", (0.0, True)),
+    (MotorParameters, MOTOR, "inertia", (-1e-6, 0.0)),
+    (MotorParameters, MOTOR, "motor_constant", (NAN,)),
+    (MotorParameters, MOTOR, "inductance", (-1.0,)),
+    (MotorParameters, MOTOR, "coulomb_friction", (INF,)),
+    (MotorParameters, MOTOR, "viscous_friction", ("much",)),
+    (MotorModel, dict(dc_gain=25.0, time_constant=0.05),
+     "dc_gain time_constant static_voltage delay", (-1.0, NAN, INF)),
+    (ObserverNoise, {}, "load voltage count", (0.0, -1.0, NAN, INF)),
+    (Encoder, {}, "counts_per_revolution", (0.0, 0.9e-3, 1.1e9, NAN, -500.0)),
+    (DriveSettings, {}, "pwm_steps", (-1,)),
+    (DriveSettings, {}, "current_noise", (NAN,)),
+    (PidGains, {}, "p tracking_time_constant feedforward_velocity",
+     (NAN, INF, -INF, "1", None, True)),
+    (PidGains, {}, "error_deadband derivative_filter_time_constant feedforward_static", (-0.1,)),
+    (ProfileLimits, {}, "velocity acceleration jerk", (0.0, -1.0, NAN)),
+    (LoopSettings, {}, "stop_time", (0.04, 0.0, -1.0, 10.1, INF, NAN)),
+    (LoopSettings, {}, "reference_delay", (math.nextafter(10.0, INF), -5e-324, NAN)),
+    (LoopSettings, {}, "reference_doubt", (math.nextafter(1.0, INF), -5e-324, NAN)),
+    (LoopSettings, {}, "transition_time", (math.nextafter(60.0, INF), -5e-324, NAN)),
+    (FaultLimits, {},
+     "current_limit current_time stall_voltage stall_velocity stall_time runaway_time "
+     "tracking_tolerance tracking_time", (-1e-9, INF, NAN)),
+    (SkidSteer, dict(wheel_separation=0.4, wheel_radius=0.1),
+     "wheel_separation wheel_radius wheel_separation_multiplier max_wheel_speed",
+     (0.0, -1.0, NAN)),
+    (Odometry, AXLE, "wheel_separation left_radius right_radius", (0.0, -0.1, NAN, INF)),
+    (Odometry, AXLE, "travel_noise turn_noise", (-1e-9, NAN, INF)),
+    (Odometry, AXLE, "window", (0,)),
+    (Odometry, AXLE, "max_wheel_speed", (0.0, NAN)),
+    (BodyCommand, {}, "timeout", (-0.1, NAN, INF)),
+    (Speeds, {}, "linear angular wheel step timeout", (0.0, -1.0, NAN, INF)),
+]  # fmt: skip
+
+
+def cases() -> Iterator[object]:
+    for make, others, names, values in TABLE:
+        for name in names.split():
+            yield pytest.param(make, others, name, values, id=f"{make.__name__}.{name}")
+
+
+@pytest.mark.parametrize(("make", "others", "name", "values"), list(cases()))
+def test_an_impossible_number_is_refused_by_its_name(make, others, name, values):
+    for value in values:
+        with pytest.raises(ParameterError, match=name):
+            make(**{**others, name: value})
+
+
+@pytest.mark.parametrize(
+    ("make", "others", "name", "values"),
+    [
+        (LoopSettings, {}, "reference_delay", (0.0, 10.0)),
+        (LoopSettings, {}, "reference_doubt", (0.0, 1.0)),
+        (LoopSettings, {}, "transition_time", (0.0, 60.0)),
+        (Odometry, AXLE, "travel_noise", (0.0,)),
+        (Odometry, AXLE, "turn_noise", (0.0,)),
+        (Odometry, AXLE, "window", (1,)),
+        (Odometry, AXLE, "max_wheel_speed", (1e-3,)),
+        *((FaultLimits, {}, name, (0.0,)) for name in FaultLimits.__dataclass_fields__),
+    ],
+)
+def test_a_number_at_its_limit_is_taken(make, others, name, values):
+    for value in values:
+        made = make(**{**others, name: value})
+        assert getattr(made, name, value) == value

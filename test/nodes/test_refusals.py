@@ -1,0 +1,36 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A node that is given what it cannot run with says so in one line and ends with code 2."""
+
+from __future__ import annotations
+
+import pytest
+
+WHEEL = "-r __ns:=/front_left"
+REFUSED = [
+    ("excite", "-p amplitude:=20.0", "must not exceed max_voltage"),
+    ("excite", "-p signal:=noise", "known are sine"),
+    ("excite", "-p wheels:=[left] -p wait:=0.2", "no subscriber on /left/motor_command"),
+    ("excite", "-p duration:=-1.0", "duration is -1.0"),
+    ("identifier", "-p window:=3.0", "demands.duration"),
+    ("motor_plant", "-p rate:=fast", "rate is 'fast'"),
+    ("motor_plant", "-p motors_file:=/nowhere.yaml", "/nowhere.yaml: cannot be read"),
+    ("motor_plant", "--params-file /nowhere.yaml", "/nowhere.yaml"),
+    ("serial_driver", "-p wheel_names:=[left,left]", "serial_driver: a wheel is named twice"),
+    ("serial_driver", "-p supply_voltage:=-12.0", "serial_driver: supply_voltage is -12"),
+    ("skid_steer", "-p wheel_radius:=-0.1", "wheel_radius"),
+    ("skid_steer", "-p angular.z.max_velocity:=1.0 -p angular.z.min_velocity:=2.0", "angular.z"),
+    ("skid_steer", "-p use_stamped_vel:=3", "use_stamped_vel"),
+    ("skid_steer", "-p left_wheel_names:=[a,front_right]", "named twice"),
+    ("teleop_wheels", "", "not a terminal"),
+    ("wheel_pid", "", "joint_name is empty"),
+    ("wheel_pid", f"-p i:=-100.0 {WHEEL}", "i is -100; it must be in [0,"),
+    ("wheel_pid", f"-p i_clamp_max:=-1.0 {WHEEL}", "i_clamp_m"),
+]
+
+
+@pytest.mark.parametrize(("node", "given", "words"), REFUSED)
+def test_a_node_refuses_what_it_cannot_run_with_in_one_line(process, node, given, words):
+    started = process(node, "--ros-args", *given.split())
+    assert started.wait(20.0) == 2
+    (line,) = started.output.strip().splitlines()
+    assert words in line
