@@ -52,7 +52,7 @@ def exists(module: str, name: str) -> bool:
 
 
 @pytest.mark.parametrize("path", SCRIPTS, ids=lambda path: path.stem)
-def test_a_benchmark_imports_public_names_that_exist(path: Path) -> None:
+def test_a_benchmark_imports_public_names_that_exist(path):
     ours = {script.stem for script in SCRIPTS}
     for module, name in imported(path):
         if module in ours or module.startswith("smp_"):

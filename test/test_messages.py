@@ -22,13 +22,13 @@ FAULTS = {
 }  # fmt: skip
 
 
-def test_the_page_of_messages_matches_the_code() -> None:
+def test_the_page_of_messages_matches_the_code():
     script = [sys.executable, ROOT / "scripts" / "messages.py"]
     made = subprocess.run(script, capture_output=True, text=True, check=True).stdout
     assert made == PAGE, "python scripts/messages.py > docs/messages.md"
 
 
 @pytest.mark.parametrize("fault", FAULTS)
-def test_no_message_has(fault: str) -> None:
+def test_no_message_has(fault):
     assert len(MESSAGES) > 400
     assert [one for one in MESSAGES if re.search(FAULTS[fault], one)] == []

@@ -38,7 +38,7 @@ def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
         yield opened
 
 
-def test_index_holds_the_readme_and_every_section(site: Path) -> None:
+def test_index_holds_the_readme_and_every_section(site):
     page = (site / "index.html").read_text()
     first = (ROOT / "README.md").read_text().split("\n\n")[1]
     assert first.split(".")[0].replace("\n", " ") in page.replace("\n", " ")
@@ -48,7 +48,7 @@ def test_index_holds_the_readme_and_every_section(site: Path) -> None:
 
 
 @pytest.mark.parametrize("width", [390, 1280])
-def test_no_page_scrolls_sideways(site: Path, browser: Browser, width: int) -> None:
+def test_no_page_scrolls_sideways(site, browser, width):
     wide = {}
     pages = sorted(p for p in site.rglob("*.html") if "_static" not in p.parts)
     assert len(pages) > 30
@@ -62,7 +62,7 @@ def test_no_page_scrolls_sideways(site: Path, browser: Browser, width: int) -> N
     assert [url for url in browser.requests if not url.startswith(("file:", "data:"))] == []
 
 
-def test_figures_are_small_and_each_is_shown() -> None:
+def test_figures_are_small_and_each_is_shown():
     figures = [path for path in FIGURES.iterdir() if path.is_file()]
     assert sum(path.stat().st_size for path in figures) < SIZE_OF_FIGURES
     pages = [ROOT / "README.md", *(ROOT / "docs").rglob("*.md")]

@@ -96,7 +96,7 @@ def entry_of(model: MotorModel, supply: float) -> MotorEntry:
     return MotorEntry(parameters, GEARBOX, ENCODER, supply, delay=model.delay)
 
 
-def test_no_motor_at_any_rate_ends_its_loop() -> None:
+def test_no_motor_at_any_rate_ends_its_loop():
     rng, supply = np.random.default_rng(7), 12.0
     for _ in range(60):
         electrical, dt = log_uniform(rng, 1e-5, 1e-2), log_uniform(rng, 2e-4, 5e-2)
@@ -108,7 +108,7 @@ def test_no_motor_at_any_rate_ends_its_loop() -> None:
 
 
 @pytest.mark.parametrize("electrical", [1e-5, 1e-4, 1e-3])
-def test_a_fast_electrical_pole_costs_the_observer_nothing(electrical: float) -> None:
+def test_a_fast_electrical_pole_costs_the_observer_nothing(electrical):
     # At 20 Hz L/R of 10 us has decayed by exp(-5000) within a sample.
     rng = np.random.default_rng(9)
     model = random_model(rng, 0.1, electrical)

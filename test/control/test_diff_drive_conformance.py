@@ -51,7 +51,7 @@ def cases(name: str):
 
 
 @cases("rate_limiter_cases")
-def test_limiter_gives_value_and_factor(case: dict) -> None:
+def test_limiter_gives_value_and_factor(case):
     limiter = limiter_of(case["limits"])
     arguments = [case[name] for name in ("v", "v0", "v1", "dt") if case[name] is not None]
     value, factor = getattr(limiter, FUNCTIONS[case["function"]])(*arguments)
@@ -60,20 +60,20 @@ def test_limiter_gives_value_and_factor(case: dict) -> None:
 
 
 @cases("rate_limiter_invalid")
-def test_limits_out_of_order_are_refused(case: dict) -> None:
+def test_limits_out_of_order_are_refused(case):
     with pytest.raises(ParameterError, match="minimum"):
         limiter_of(case["limits"])
 
 
 @cases("rate_limiter_valid")
 @pytest.mark.parametrize("absent", [None, math.nan])
-def test_limits_that_are_not_given_are_accepted(case: dict, absent: float | None) -> None:
+def test_limits_that_are_not_given_are_accepted(case, absent):
     limits = {name: absent if x is None else x for name, x in case["limits"].items()}
     assert math.isfinite(limiter_of(limits).limit(10.0, 0.0, 0.0, 0.1).value)
 
 
 @cases("inverse_kinematics_cases")
-def test_body_velocity_becomes_wheel_speeds_and_back(case: dict) -> None:
+def test_body_velocity_becomes_wheel_speeds_and_back(case):
     names = (
         "wheel_separation",
         "wheel_separation_multiplier",
@@ -90,7 +90,7 @@ def test_body_velocity_becomes_wheel_speeds_and_back(case: dict) -> None:
 
 
 @pytest.mark.parametrize("case", CASES["linorobot_kinematics_cases"])
-def test_wheels_stay_within_their_reach(case: dict) -> None:
+def test_wheels_stay_within_their_reach(case):
     to_rpm = 30.0 / math.pi
     robot = SkidSteer(
         wheel_separation=case["track"],
@@ -115,7 +115,7 @@ def apply(odometry: Odometry, update: dict) -> bool | None:
 
 
 @cases("odometry_cases")
-def test_odometry_ends_where_the_wheels_lead(case: dict) -> None:
+def test_odometry_ends_where_the_wheels_lead(case):
     names = ("wheel_separation", "left_radius", "right_radius", "window")
     odometry = Odometry(**{name: case[name] for name in names})
     expected = dict(case["expect"])
@@ -135,7 +135,7 @@ def test_odometry_ends_where_the_wheels_lead(case: dict) -> None:
         assert getattr(odometry, name) == pytest.approx(value, abs=case["abs_tol"]), name
 
 
-def test_speed_limiter_reaches_each_speed_on_the_very_update() -> None:
+def test_speed_limiter_reaches_each_speed_on_the_very_update():
     case = CASES["controller_speed_limiter"]
     prefix = "linear.x."
     limiter = SpeedLimiter(

@@ -35,7 +35,7 @@ def found(
     return 0, None
 
 
-def test_limits_are_those_of_the_table_of_faults() -> None:
+def test_limits_are_those_of_the_table_of_faults():
     assert asdict(FaultLimits()) == {
         "current_limit": 0.0, "current_time": 0.1, "stall_voltage": 4.0, "stall_velocity": 0.02,
         "stall_time": 0.5, "runaway_time": 0.2, "tracking_tolerance": 0.5, "tracking_time": 0.45,
@@ -46,7 +46,7 @@ def test_limits_are_those_of_the_table_of_faults() -> None:
     assert Recovery().first_pause == 2.0
 
 
-def test_over_current_counts_above_its_limit_and_in_succession() -> None:
+def test_over_current_counts_above_its_limit_and_in_succession():
     high, limit = (6.0, 1.0, -3.0 * ABOVE), (6.0, 1.0, 3.0)
     assert found(repeat(high, 9)) == (4, Fault.OVER_CURRENT)
     assert found(repeat(limit, 99)) == (0, None)
@@ -55,7 +55,7 @@ def test_over_current_counts_above_its_limit_and_in_succession() -> None:
     assert found(repeat((6.0, 1.0, 0.6), 9), replace(LIMITS, current_limit=0.5))[0] == 4
 
 
-def test_stall_counts_at_its_voltage_below_its_speed_and_in_succession() -> None:
+def test_stall_counts_at_its_voltage_below_its_speed_and_in_succession():
     still, turns = (-4.0, 0.0, math.nan), (-4.0, -SLOW, math.nan)
     assert found(repeat(still, 99)) == (32, Fault.NO_MOTION)
     assert found(repeat(turns, 99)) == (0, None)
@@ -65,7 +65,7 @@ def test_stall_counts_at_its_voltage_below_its_speed_and_in_succession() -> None
     assert found(repeat(still, 999), replace(LIMITS, stall_time=0.0)) == (0, None)
 
 
-def test_runaway_counts_from_half_of_the_stall_voltage_and_in_succession() -> None:
+def test_runaway_counts_from_half_of_the_stall_voltage_and_in_succession():
     against = (2.0, -SLOW, 0.0)
     assert found(repeat(against, 99)) == (16, Fault.RUNAWAY)
     assert found(repeat((-2.0, SLOW, 0.0), 99)) == (16, Fault.RUNAWAY)
@@ -77,7 +77,7 @@ def test_runaway_counts_from_half_of_the_stall_voltage_and_in_succession() -> No
     assert found(repeat((6.0, 0.0, 0.0), 99), calm) == (0, None), "at rest it is not against"
 
 
-def test_a_wheel_that_slows_down_by_a_fifth_is_braked_and_no_runaway() -> None:
+def test_a_wheel_that_slows_down_by_a_fifth_is_braked_and_no_runaway():
     def braked(share: float) -> Iterable[tuple[float, float, float]]:
         return ((6.0, -(share ** (k // 8)), 0.0) for k in range(64))
 
@@ -97,13 +97,13 @@ def test_a_wheel_that_slows_down_by_a_fifth_is_braked_and_no_runaway() -> None:
         (6.9, math.nan, Fault.NO_MOTION),
     ],
 )
-def test_the_current_tells_a_stall_from_a_dead_encoder(current, resistance, fault) -> None:
+def test_the_current_tells_a_stall_from_a_dead_encoder(current, resistance, fault):
     detector = FaultDetector(replace(LIMITS, current_limit=0.0), resistance)
     assert found(repeat((-8.0, 0.0, current), 99), detector=detector) == (32, fault)
 
 
 @pytest.mark.parametrize("sample", [(6.0, 1.0, 9.0), (6.0, 0.0, 0.0), (6.0, -1.0, 0.0)])
-def test_a_reset_clears_the_counts(sample: tuple[float, float, float]) -> None:
+def test_a_reset_clears_the_counts(sample):
     detector = FaultDetector(LIMITS)
     first, fault = found(repeat(sample, 99), detector=FaultDetector(LIMITS))
     assert found(repeat(sample, first - 1), detector=detector) == (0, None)
@@ -127,7 +127,7 @@ def followed(
     return 0, None
 
 
-def test_an_error_beyond_half_and_a_little_is_a_fault_in_the_second_window() -> None:
+def test_an_error_beyond_half_and_a_little_is_a_fault_in_the_second_window():
     slow, near = (2.0, 0.65, 6.0, False), (2.0, 0.75, 6.0, False)  # 1.3 is allowed
     assert followed(slow, slow) == (2, Fault.NOT_FOLLOWING)
     assert followed(near, near, near) == (0, None)
@@ -139,12 +139,12 @@ def test_an_error_beyond_half_and_a_little_is_a_fault_in_the_second_window() -> 
     assert followed(slow, slow, limits=replace(LIMITS, tracking_time=0.0)) == (0, None)
 
 
-def test_an_error_that_shrinks_by_a_twentieth_is_a_wheel_that_accelerates() -> None:
+def test_an_error_that_shrinks_by_a_twentieth_is_a_wheel_that_accelerates():
     assert followed((2.0, 0.2, 6.0, False), (2.0, 0.28, 6.0, False))[0] == 2  # 1.8 to 1.72
     assert followed((2.0, 0.2, 6.0, False), (2.0, 0.30, 6.0, False))[0] == 0  # 1.8 to 1.70
 
 
-def test_a_wheel_that_reverses_more_slowly_than_its_reference_is_not_a_fault() -> None:
+def test_a_wheel_that_reverses_more_slowly_than_its_reference_is_not_a_fault():
     """Its error grows while the reference goes over to the other direction, and it slows down."""
     asked = (-0.3, -0.9, 6.0, False), (2.0, -0.6, 6.0, False), (2.0, -0.2, 6.0, False)
     assert followed(*asked) == (0, None)
@@ -152,7 +152,7 @@ def test_a_wheel_that_reverses_more_slowly_than_its_reference_is_not_a_fault() -
     assert followed(*stuck) == (2, Fault.WRONG_WAY)
 
 
-def test_means_are_compared_and_not_samples() -> None:
+def test_means_are_compared_and_not_samples():
     swings = (2.0, lambda j: 1.9 + (-1) ** j, 6.0, False)
     assert followed(*[swings] * 9) == (0, None)
     swings = (2.0, lambda j: 0.6 + 9 * (-1) ** j, 6.0, False)
@@ -160,7 +160,7 @@ def test_means_are_compared_and_not_samples() -> None:
 
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])
-def test_at_the_voltage_limit_only_the_speed_it_allows_is_expected(sign: float) -> None:
+def test_at_the_voltage_limit_only_the_speed_it_allows_is_expected(sign):
     def at(speed: float) -> tuple:
         return (sign * 10.0, sign * speed, sign * 12.0, True)
 
@@ -188,7 +188,7 @@ def test_at_the_voltage_limit_only_the_speed_it_allows_is_expected(sign: float) 
         ((0.28, 0.28, 0.28 * 12.0 / 3.8), False),  # too slow
     ],
 )
-def test_volts_per_speed_are_learnt_while_the_wheel_follows(learning, learns) -> None:
+def test_volts_per_speed_are_learnt_while_the_wheel_follows(learning, learns):
     # At 2.0: enough of 3.8, too little of 10.
     at = (10.0, 2.0, 12.0, True)
     assert followed((*learning, False), at, at)[0] == (0 if learns else 3)
@@ -198,7 +198,7 @@ def test_volts_per_speed_are_learnt_while_the_wheel_follows(learning, learns) ->
         assert followed((*learning, False), slow, slow)[0] == 3
 
 
-def test_a_wheel_that_stands_still_is_named_by_the_stall_and_not_twice() -> None:
+def test_a_wheel_that_stands_still_is_named_by_the_stall_and_not_twice():
     for limits, named in ((LIMITS, None), (replace(LIMITS, stall_time=0.0), Fault.NOT_FOLLOWING)):
         detector, fault = FaultDetector(limits), None
         for _ in range(31):
@@ -208,7 +208,7 @@ def test_a_wheel_that_stands_still_is_named_by_the_stall_and_not_twice() -> None
         assert fault is named
 
 
-def test_a_pause_ends_after_its_time_and_doubles() -> None:
+def test_a_pause_ends_after_its_time_and_doubles():
     recovery, now = Recovery(first_pause=1.0), 100.0
     for pause in (1.0, 2.0, 4.0):
         recovery.set(Fault.RUNAWAY, now)
@@ -225,7 +225,7 @@ def test_a_pause_ends_after_its_time_and_doubles() -> None:
     assert (recovery.fault, recovery.cautious, recovery.failures) == (None, False, 0)
 
 
-def test_a_set_point_of_zero_and_counts_release_a_wheel_before_its_pause() -> None:
+def test_a_set_point_of_zero_and_counts_release_a_wheel_before_its_pause():
     for fault in Fault:
         cases = [(0.0, 0.5, False), (0.0, 0.5 + DT, False), (0.1, 9.0, False), (0.1, 0.0, True)]
         for setpoint, waited, turns in cases:
@@ -237,7 +237,7 @@ def test_a_set_point_of_zero_and_counts_release_a_wheel_before_its_pause() -> No
             assert released is (rested or (turns and silent))
 
 
-def test_a_try_is_trusted_after_its_time_and_proven_after_two_seconds() -> None:
+def test_a_try_is_trusted_after_its_time_and_proven_after_two_seconds():
     recovery, most = Recovery(), 1.05 * 4.0
     recovery.set(Fault.RUNAWAY, 0.0)
     turn = lambda volts, speed: recovery.limit_voltage(volts, speed, 0.125, LIMITS)  # noqa: E731

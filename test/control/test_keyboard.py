@@ -11,14 +11,14 @@ from smp_motor_control.keyboard import BODY_KEYS, Keyboard, Speeds, parse_keys
 SPEEDS = Speeds(linear=0.2, angular=0.6, wheel=1.5, step=0.1, timeout=0.6)
 
 
-def test_nothing_moves_before_the_first_key() -> None:
+def test_nothing_moves_before_the_first_key():
     keyboard = Keyboard(SPEEDS)
     assert not keyboard.driving(100.0)
     assert keyboard.body(100.0) == (0.0, 0.0)
     assert set(keyboard.wheels(100.0).values()) == {0.0}
 
 
-def test_released_key_stops_after_the_timeout() -> None:
+def test_released_key_stops_after_the_timeout():
     keyboard = Keyboard(SPEEDS)
     for now in (0.0, 0.5, 0.53, 0.56):  # a press, and its repeats after the first delay
         keyboard.press("w", now)
@@ -29,7 +29,7 @@ def test_released_key_stops_after_the_timeout() -> None:
 
 
 @pytest.mark.parametrize("key", [" ", "k", "5", "m", "+", "\n"])
-def test_any_other_key_stops_at_once(key: str) -> None:
+def test_any_other_key_stops_at_once(key):
     keyboard = Keyboard(SPEEDS)
     keyboard.press("w", 0.0)
     keyboard.press(key, 0.1)
@@ -37,14 +37,14 @@ def test_any_other_key_stops_at_once(key: str) -> None:
 
 
 @pytest.mark.parametrize("key", BODY_KEYS)
-def test_body_keys_ask_for_their_share_of_both_speeds(key: str) -> None:
+def test_body_keys_ask_for_their_share_of_both_speeds(key):
     keyboard = Keyboard(SPEEDS)
     keyboard.press(key, 0.0)
     linear, angular = BODY_KEYS[key]
     assert keyboard.body(0.0) == (linear * 0.2, angular * 0.6)
 
 
-def test_wheel_mode_drives_the_selected_wheels_alone() -> None:
+def test_wheel_mode_drives_the_selected_wheels_alone():
     keyboard = Keyboard(SPEEDS)
     for key in ("m", "3", "s"):
         keyboard.press(key, 0.0)
@@ -54,14 +54,14 @@ def test_wheel_mode_drives_the_selected_wheels_alone() -> None:
     assert set(keyboard.wheels(0.0).values()) == {1.5}
 
 
-def test_turning_keys_do_nothing_in_wheel_mode() -> None:
+def test_turning_keys_do_nothing_in_wheel_mode():
     keyboard = Keyboard(SPEEDS)
     keyboard.press("m", 0.0)
     keyboard.press("a", 0.0)
     assert not keyboard.driving(0.0)
 
 
-def test_speed_steps_are_bounded_and_undo_each_other() -> None:
+def test_speed_steps_are_bounded_and_undo_each_other():
     keyboard = Keyboard(SPEEDS)
     keyboard.press("+", 0.0)
     keyboard.press("-", 0.0)
@@ -86,5 +86,5 @@ def test_speed_steps_are_bounded_and_undo_each_other() -> None:
         ("", []),
     ],
 )
-def test_characters_are_taken_for_the_keys_that_send_them(text: str, keys: list) -> None:
+def test_characters_are_taken_for_the_keys_that_send_them(text, keys):
     assert parse_keys(text) == keys

@@ -70,7 +70,7 @@ def rms(x: np.ndarray) -> float:
 
 @pytest.mark.parametrize("name", MOTORS)
 @pytest.mark.parametrize("rate", [200.0, 1000.0])
-def test_error_is_at_most_half_of_differenced_counts(name: str, rate: float) -> None:
+def test_error_is_at_most_half_of_differenced_counts(name, rate):
     p = MOTORS[name]
     # Every number of the model wrong by 1 %, as after a mediocre identification.
     wrong = {n: 1.01 * getattr(p, n) for n in ("dc_gain", "time_constant")}
@@ -80,7 +80,7 @@ def test_error_is_at_most_half_of_differenced_counts(name: str, rate: float) -> 
 
 
 @pytest.mark.parametrize("name", MOTORS)
-def test_unknown_load_leaves_no_bias_and_is_told(name: str) -> None:
+def test_unknown_load_leaves_no_bias_and_is_told(name):
     p = MOTORS[name]
     observer = SpeedObserver(model_of(p), 0.005, ENCODER)
     seen, _ = errors_of(p, observer, 0.005, duration=4.0, load=1.5)
@@ -91,7 +91,7 @@ def test_unknown_load_leaves_no_bias_and_is_told(name: str) -> None:
     assert observer.trusted
 
 
-def test_jitter_of_a_fifth_of_the_interval_does_not_matter() -> None:
+def test_jitter_of_a_fifth_of_the_interval_does_not_matter():
     p = MOTORS["motor 1"]
     observer = SpeedObserver(model_of(p), 0.005, ENCODER)
     seen, _ = errors_of(p, observer, 0.005, jitter=0.2)
@@ -101,7 +101,7 @@ def test_jitter_of_a_fifth_of_the_interval_does_not_matter() -> None:
 
 
 @pytest.mark.parametrize("late", [0.02, 0.05, 0.2])  # of a sample, either way
-def test_stamps_that_scatter_by_many_counts_are_no_contradiction(late: float) -> None:
+def test_stamps_that_scatter_by_many_counts_are_no_contradiction(late):
     """The counts are read on the beat, and stamped when they arrive."""
     p, dt = MOTORS["motor 1"], 0.005
     fine, rng, motor = Encoder(2_000.0), np.random.default_rng(6), Motor(p)
@@ -122,7 +122,7 @@ def test_stamps_that_scatter_by_many_counts_are_no_contradiction(late: float) ->
     assert rms(np.array(errors)) < 0.5 * late * math.sqrt(2.0 / 3.0) * usual
 
 
-def test_lost_samples_are_bridged_by_the_model() -> None:
+def test_lost_samples_are_bridged_by_the_model():
     p, dt = MOTORS["motor 1"], 0.005
     motor, observer = Motor(p), SpeedObserver(model_of(p), dt, ENCODER)
     errors = []
@@ -135,7 +135,7 @@ def test_lost_samples_are_bridged_by_the_model() -> None:
     assert observer.trusted
 
 
-def test_wrapping_counter_makes_no_difference() -> None:
+def test_wrapping_counter_makes_no_difference():
     p = MOTORS["motor 1"]
     narrow, wide = Encoder(500.0, bits=12), Encoder(500.0)
     motor = Motor(p)
@@ -149,7 +149,7 @@ def test_wrapping_counter_makes_no_difference() -> None:
         assert speeds[0] == pytest.approx(speeds[1], nan_ok=True)
 
 
-def test_known_delay_is_taken_into_account() -> None:
+def test_known_delay_is_taken_into_account():
     p, dt, delay = MOTORS["motor 2"], 0.005, 0.0075
     motor = Motor(p)
     aware = SpeedObserver(model_of(p, delay=delay), dt, ENCODER)
@@ -169,7 +169,7 @@ def test_known_delay_is_taken_into_account() -> None:
 
 
 @pytest.mark.parametrize("factor", [3.0, 0.3])
-def test_wrong_model_is_noticed_and_counts_take_over(factor: float) -> None:
+def test_wrong_model_is_noticed_and_counts_take_over(factor):
     p = MOTORS["motor 1"]
     wrong = model_of(p, dc_gain=factor * p.dc_gain, time_constant=p.time_constant / factor)
     observer = SpeedObserver(wrong, 0.005, ENCODER, window=1)
@@ -186,7 +186,7 @@ def test_wrong_model_is_noticed_and_counts_take_over(factor: float) -> None:
     assert fell_back > 40
 
 
-def test_trust_comes_back_when_model_and_counts_agree_again() -> None:
+def test_trust_comes_back_when_model_and_counts_agree_again():
     p = MOTORS["motor 1"]
     motor, observer = Motor(p), SpeedObserver(model_of(p), 0.005, ENCODER)
     trusted = []
@@ -202,7 +202,7 @@ def test_trust_comes_back_when_model_and_counts_agree_again() -> None:
     assert observer.speed == pytest.approx(motor.speed, abs=1.5)  # four deviations of 0.35
 
 
-def test_impossible_load_is_not_trusted() -> None:
+def test_impossible_load_is_not_trusted():
     p = MOTORS["motor 1"]
     motor = Motor(p)
     observer = SpeedObserver(model_of(p), 0.005, ENCODER, max_load=18.0)
@@ -216,7 +216,7 @@ def test_impossible_load_is_not_trusted() -> None:
     assert observer.speed < 0.0
 
 
-def test_standstill_is_zero_whatever_voltage_sticks() -> None:
+def test_standstill_is_zero_whatever_voltage_sticks():
     p = MOTORS["motor 1"]
     motor, observer = Motor(p), SpeedObserver(model_of(p), 0.005, ENCODER)
     for _ in range(400):
@@ -228,7 +228,7 @@ def test_standstill_is_zero_whatever_voltage_sticks() -> None:
 
 
 @pytest.mark.parametrize("bad", [(math.nan, 0.005), (1.0, 0.0), (1.0, -0.1), (1.0, math.nan)])
-def test_sample_that_makes_no_sense_is_refused_and_changes_nothing(bad: tuple) -> None:
+def test_sample_that_makes_no_sense_is_refused_and_changes_nothing(bad):
     p = MOTORS["motor 1"]
     disturbed, calm = (SpeedObserver(model_of(p), 0.005, ENCODER) for _ in range(2))
     for observer in (disturbed, calm):
@@ -239,7 +239,7 @@ def test_sample_that_makes_no_sense_is_refused_and_changes_nothing(bad: tuple) -
     assert disturbed.step(61, 6.0, 0.005) == calm.step(61, 6.0, 0.005)
 
 
-def test_long_gap_begins_again_from_the_counts() -> None:
+def test_long_gap_begins_again_from_the_counts():
     p = MOTORS["motor 1"]
     motor, observer = Motor(p), SpeedObserver(model_of(p), 0.005, ENCODER)
     for step in [0.005] * 200 + [3.0] + [0.005] * 200:
@@ -249,7 +249,7 @@ def test_long_gap_begins_again_from_the_counts() -> None:
 
 
 @pytest.mark.parametrize("electrical", [2e-4, 1e-3, 1e-2])
-def test_gain_is_that_of_the_recursion_run_in_fine_steps(electrical: float) -> None:
+def test_gain_is_that_of_the_recursion_run_in_fine_steps(electrical):
     # The covariance carried step by step through fiftieths of L/R, in which the exponential of
     # Van Loan's block matrix is harmless, and corrected every 20 ms, until it repeats.
     dt, tau, gain, quantum, noise = 0.02, 0.1, 20.0, 2.0 * math.pi / 500.0, ObserverNoise()
@@ -276,7 +276,7 @@ def test_gain_is_that_of_the_recursion_run_in_fine_steps(electrical: float) -> N
     assert steady_gain(model, quantum, noise, dt)[:4] == pytest.approx(K, rel=1e-6)
 
 
-def test_gain_stabilises_the_observer_of_any_motor_at_any_rate() -> None:
+def test_gain_stabilises_the_observer_of_any_motor_at_any_rate():
     rng = np.random.default_rng(5)
     for _ in range(100):
         electrical, tau = 10.0 ** rng.uniform(-9, -2), 10.0 ** rng.uniform(-3, 1)

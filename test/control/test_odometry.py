@@ -46,7 +46,7 @@ def state(odometry: Odometry) -> np.ndarray:
 
 
 @pytest.mark.parametrize("way", ["velocity", "position", "travel", "open loop"])
-def test_pose_and_covariance_follow_arcs_forth_and_back(way: str) -> None:
+def test_pose_and_covariance_follow_arcs_forth_and_back(way):
     draw, odometry = random.Random(way), make()
     pose, p = np.zeros(3), np.zeros((3, 3))
     angles = [4.0, -7.0]
@@ -73,7 +73,7 @@ def test_pose_and_covariance_follow_arcs_forth_and_back(way: str) -> None:
 
 
 @pytest.mark.parametrize("turn", [0.0, 1e-9, 0.9e-6, 1.1e-6, 1e-5, -1e-5, 3.0])
-def test_a_turn_however_small_keeps_the_arc(turn: float) -> None:
+def test_a_turn_however_small_keeps_the_arc(turn):
     odometry = make()
     left, right = 1.0 - turn * B / 2, 1.0 + turn * B / 2
     odometry.set_odometry(1.0, 2.0, 0.7)
@@ -83,7 +83,7 @@ def test_a_turn_however_small_keeps_the_arc(turn: float) -> None:
     assert state(odometry) == pytest.approx(wanted, abs=1e-9)
 
 
-def test_velocity_is_the_mean_over_its_window_and_its_variance_that_of_the_travel() -> None:
+def test_velocity_is_the_mean_over_its_window_and_its_variance_that_of_the_travel():
     odometry, speeds = make(window=4), []
     draw = random.Random(2)
     for _ in range(10):
@@ -101,7 +101,7 @@ def test_velocity_is_the_mean_over_its_window_and_its_variance_that_of_the_trave
         assert angular == pytest.approx(of_sides / B**2 + TURN * abs(odometry.angular) / span)
 
 
-def test_speeds_and_commands_are_reported_as_they_are_given() -> None:
+def test_speeds_and_commands_are_reported_as_they_are_given():
     odometry = make()
     odometry.update_from_travel(1.0, 1.0, 3.0, -2.0)
     assert odometry.linear == pytest.approx((3.0 * LEFT - 2.0 * RIGHT) / 2.0)
@@ -110,7 +110,7 @@ def test_speeds_and_commands_are_reported_as_they_are_given() -> None:
     assert (odometry.linear, odometry.angular) == (0.25, -0.5)
 
 
-def test_a_pose_that_is_set_is_without_doubt_and_a_reset_forgets_all() -> None:
+def test_a_pose_that_is_set_is_without_doubt_and_a_reset_forgets_all():
     odometry = make()
     odometry.update_from_position(0.0, 0.0, 0.1)
     odometry.update_from_position(1.0, 2.0, 0.1)
@@ -130,7 +130,7 @@ BAD = [math.nan, math.inf, -math.inf]
 
 
 @pytest.mark.parametrize("bad", BAD)
-def test_non_finite_values_change_nothing(bad: float) -> None:
+def test_non_finite_values_change_nothing(bad):
     odometry = make()
     odometry.update_from_position(0.0, 0.0, 0.1)
     odometry.update_from_velocity(1.0, 2.0, 0.1)
@@ -151,7 +151,7 @@ def test_non_finite_values_change_nothing(bad: float) -> None:
 
 
 @pytest.mark.parametrize("side", [0, 1])
-def test_positions_of_a_wheel_that_would_be_too_fast_are_no_motion(side: int) -> None:
+def test_positions_of_a_wheel_that_would_be_too_fast_are_no_motion(side):
     odometry = make(max_wheel_speed=8.0)
     at = lambda angle: tuple(angle if k == side else 0.0 for k in range(2))  # noqa: E731
     odometry.update_from_position(*at(0.0), 0.125)
@@ -163,7 +163,7 @@ def test_positions_of_a_wheel_that_would_be_too_fast_are_no_motion(side: int) ->
     assert odometry.heading == pytest.approx((1.0 + 0.5) * radius / B * (1 if side else -1))
 
 
-def test_ten_steps_and_their_noise_are_the_default() -> None:
+def test_ten_steps_and_their_noise_are_the_default():
     plain = Odometry(B, LEFT, RIGHT)
     for k in range(12):  # ten steps are the mean, 1e-4 and 1e-2 the noise, by default
         plain.update_from_velocity(10.0 * k, 8.0 * k, 0.1)
@@ -173,7 +173,7 @@ def test_ten_steps_and_their_noise_are_the_default() -> None:
     assert plain.twist_variances(1.0) == pytest.approx((of_sides / 4, of_sides / B**2 + 1e-2 * 2.0))
 
 
-def test_a_new_geometry_counts_from_the_next_step_on() -> None:
+def test_a_new_geometry_counts_from_the_next_step_on():
     odometry = make()
     odometry.update_from_travel(1.0, 0.8, 0.0, 0.0)
     odometry.configure(1.0, 0.2, 0.3, 0.0, 0.0)

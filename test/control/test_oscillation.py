@@ -68,7 +68,7 @@ def drive(
     return found, wheel
 
 
-def test_the_papers_gains_at_50_hz_swing_and_are_named_without_a_model() -> None:
+def test_the_papers_gains_at_50_hz_swing_and_are_named_without_a_model():
     settings = given("gains_paper.yaml")
     assert settings.loop.model is None and settings.loop.drive is None
     found, wheel = drive(settings, 50.0)
@@ -83,14 +83,14 @@ def test_the_papers_gains_at_50_hz_swing_and_are_named_without_a_model() -> None
 @pytest.mark.parametrize(
     ("rate", "p"), [(20.0, 50.0), (50.0, 10.0), (100.0, 10.0), (200.0, 20.0), (200.0, 300.0)]
 )
-def test_gains_beyond_the_limit_of_stability_are_named_at_any_rate(rate: float, p: float) -> None:
+def test_gains_beyond_the_limit_of_stability_are_named_at_any_rate(rate, p):
     found, wheel = drive(p_alone(p), rate)
     assert found < 5.0 and wheel.state is State.DRIVING
 
 
 @pytest.mark.parametrize("rate", [100.0, 200.0, 500.0])
 @pytest.mark.parametrize("speed", [0.0, 0.02, 0.1, 0.5, 2.4])
-def test_a_wheel_that_follows_swings_at_no_speed(rate: float, speed: float) -> None:
+def test_a_wheel_that_follows_swings_at_no_speed(rate, speed):
     found, _ = drive(given("gains.yaml"), rate, lambda t: speed, seconds=6.0)
     assert found == math.inf
 
@@ -103,19 +103,19 @@ def test_a_wheel_that_follows_swings_at_no_speed(rate: float, speed: float) -> N
         lambda t: 2.0 * round(math.sin(9.0 * t)),
     ],
 )
-def test_a_wheel_that_is_asked_to_swing_is_not_blamed(target: Callable[[float], float]) -> None:
+def test_a_wheel_that_is_asked_to_swing_is_not_blamed(target):
     found, _ = drive(given("gains.yaml"), 200.0, target)
     assert found == math.inf
 
 
 @pytest.mark.parametrize("seed", range(4))
 @pytest.mark.parametrize("rate", [100.0, 200.0, 500.0])
-def test_noise_is_not_an_oscillation(rate: float, seed: int) -> None:
+def test_noise_is_not_an_oscillation(rate, seed):
     found, _ = drive(given("gains.yaml"), rate, lambda t: 1.0, 0.3, seed=seed)
     assert found == math.inf
 
 
-def test_a_swing_is_over_when_its_gains_are() -> None:
+def test_a_swing_is_over_when_its_gains_are():
     swings = Oscillation()
     for k in range(400):
         swings.add(0.01, 1.0, 1.0 + 0.8 * math.sin(40.0 * 0.01 * k))
@@ -127,7 +127,7 @@ def test_a_swing_is_over_when_its_gains_are() -> None:
     assert swings.found is None
 
 
-def test_counts_that_come_and_go_are_no_swing() -> None:
+def test_counts_that_come_and_go_are_no_swing():
     """One of 16 counts a turn in 10 ms is 39 rad/s."""
     swings = Oscillation()
     swings.set_count(2 * math.pi / 16)
@@ -138,7 +138,7 @@ def test_counts_that_come_and_go_are_no_swing() -> None:
 
 @pytest.mark.parametrize("reading", [-999.0, 999.0, -60.0, -12.0, 8.0, -3.0, 0.0])
 @pytest.mark.parametrize("apart", [0.5, 0.2])
-def test_a_false_reading_now_and_then_stops_no_wheel(reading: float, apart: float) -> None:
+def test_a_false_reading_now_and_then_stops_no_wheel(reading, apart):
     """Without drive.*, the motor's abilities are unknown."""
     world = World().run(2.0)
     every = round(apart / DT)

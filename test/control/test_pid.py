@@ -24,7 +24,7 @@ def settle(pid: Pid, reference: float, measurement: float, steps: int, dt: float
 
 
 @pytest.mark.parametrize("strategy", ["back_calculation", "conditional_integration"])
-def test_integral_does_not_wind_up_while_output_saturates(strategy: str) -> None:
+def test_integral_does_not_wind_up_while_output_saturates(strategy):
     pid = Pid(PidGains(p=1.0, i=10.0, antiwindup_strategy=strategy, **VOLTS))
     out = settle(pid, 20.0, 0.0, 1000)
     assert out.saturated
@@ -34,7 +34,7 @@ def test_integral_does_not_wind_up_while_output_saturates(strategy: str) -> None
 
 
 @pytest.mark.parametrize("p", [0.0, 2.0])
-def test_back_calculation_with_time_constant_zero_never_makes_nan(p: float) -> None:
+def test_back_calculation_with_time_constant_zero_never_makes_nan(p):
     pid = Pid(PidGains(p=p, i=3.0, antiwindup_strategy="back_calculation", **VOLTS))
     out = settle(pid, 50.0, 0.0, 500)
     assert math.isfinite(out.i_term)
@@ -54,7 +54,7 @@ def test_back_calculation_with_time_constant_zero_never_makes_nan(p: float) -> N
     ],
     ids=str,
 )
-def test_change_of_gains_makes_no_jump_of_the_command(change: dict) -> None:
+def test_change_of_gains_makes_no_jump_of_the_command(change):
     gains = PidGains(p=1.0, i=4.0, d=0.1, feedforward_velocity=0.1)
     # Neighbouring steps of the very same input differ by i e dt alone.
     changed, unchanged = Pid(gains), Pid(gains)
@@ -66,7 +66,7 @@ def test_change_of_gains_makes_no_jump_of_the_command(change: dict) -> None:
 
 
 @pytest.mark.parametrize("dt", [-1e-3, -math.inf, math.nan, math.inf])
-def test_time_that_does_not_pass_forward_is_refused_and_changes_nothing(dt: float) -> None:
+def test_time_that_does_not_pass_forward_is_refused_and_changes_nothing(dt):
     pid = Pid(PidGains(p=1.0, i=2.0))
     settle(pid, 1.0, 0.0, 5)
     before = pid.i_term
@@ -75,13 +75,13 @@ def test_time_that_does_not_pass_forward_is_refused_and_changes_nothing(dt: floa
     assert pid.i_term == before
 
 
-def test_time_step_of_zero_repeats_the_last_command() -> None:
+def test_time_step_of_zero_repeats_the_last_command():
     pid = Pid(PidGains(p=1.0, i=2.0))
     first = pid.step(1.0, 0.0, 0.1)
     assert pid.step(5.0, 0.0, 0.0) == first
 
 
-def test_output_is_a_value_of_its_own() -> None:
+def test_output_is_a_value_of_its_own():
     pid = Pid(PidGains(p=1.0))
     first = pid.step(1.0, 0.0, 0.1)
     pid.step(2.0, 0.0, 0.1)
@@ -103,8 +103,8 @@ gain = st.floats(0.0, 1e3)
     inputs=st.lists(st.tuples(finite, finite, st.floats(1e-4, 1.0), finite), max_size=20),
 )
 def test_output_never_leaves_its_clamp_and_the_integral_stays_finite(
-    p: float, i: float, d: float, strategy: str, tracking: float, inputs: list
-) -> None:
+    p, i, d, strategy, tracking, inputs
+):
     pid = Pid(
         PidGains(
             p=p,

@@ -39,7 +39,7 @@ def gains_of(given: dict, **more: object) -> PidGains:
 
 
 @pytest.mark.parametrize("case", CASES["cases"], ids=lambda case: case["id"])
-def test_sequence_gives_the_numbers_of_control_toolbox(case: dict) -> None:
+def test_sequence_gives_the_numbers_of_control_toolbox(case):
     pid = Pid(gains_of(case["gains"]))
     if "expect_tracking_time_constant" in case:
         assert pid.tracking_time_constant == case["expect_tracking_time_constant"]
@@ -63,7 +63,7 @@ def test_sequence_gives_the_numbers_of_control_toolbox(case: dict) -> None:
 
 
 @pytest.mark.parametrize("case", CASES["pid_controller_cases"], ids=lambda case: case["id"])
-def test_whole_controller_gives_the_numbers_of_pid_controller(case: dict) -> None:
+def test_whole_controller_gives_the_numbers_of_pid_controller(case):
     forward = case.get("feedforward_gain", 0.0) if case.get("feedforward_enabled") else 0.0
     reference, state, dt = case["reference"], case["state"], case["dt"]
     if case.get("angle_wraparound"):  # the caller's business: the shortest way to the reference
@@ -99,7 +99,7 @@ def test_whole_controller_gives_the_numbers_of_pid_controller(case: dict) -> Non
     [case for case in CASES["parameter_cases"] if isinstance(case.get("input"), dict)],
     ids=lambda case: case["id"],
 )
-def test_bad_bounds_are_refused_on_construction(case: dict) -> None:
+def test_bad_bounds_are_refused_on_construction(case):
     with pytest.raises(ParameterError, match="clamp"):
         gains_of(case["input"])
 
@@ -109,7 +109,7 @@ def test_bad_bounds_are_refused_on_construction(case: dict) -> None:
     [case for case in CASES["parameter_cases"] if "set" in case],
     ids=lambda case: case["id"],
 )
-def test_bad_bounds_leave_the_gains_as_they_were(case: dict) -> None:
+def test_bad_bounds_leave_the_gains_as_they_were(case):
     gains = gains_of(case["initial"])
     pid = Pid(gains)
     with pytest.raises(ParameterError, match="clamp"):
@@ -118,7 +118,7 @@ def test_bad_bounds_leave_the_gains_as_they_were(case: dict) -> None:
 
 
 @pytest.mark.parametrize("strategy", ["", "undefined", "Back_Calculation", "legacy", None, 3])
-def test_other_strategies_are_refused_by_name(strategy: object) -> None:
+def test_other_strategies_are_refused_by_name(strategy):
     with pytest.raises(ParameterError, match="antiwindup_strategy"):
         PidGains(antiwindup_strategy=strategy)
 
@@ -137,6 +137,6 @@ def test_other_strategies_are_refused_by_name(strategy: object) -> None:
     ],
     ids=str,
 )
-def test_rules_of_validation_hold(wrong: dict) -> None:
+def test_rules_of_validation_hold(wrong):
     with pytest.raises(ParameterError, match=next(reversed(wrong))):
         PidGains(**wrong)

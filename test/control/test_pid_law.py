@@ -93,7 +93,7 @@ def drawn_gains(draw: random.Random) -> PidGains:
 
 
 @pytest.mark.parametrize("seed", range(6))
-def test_every_term_of_random_controllers_follows_the_law(seed: int) -> None:
+def test_every_term_of_random_controllers_follows_the_law(seed):
     draw = random.Random(seed)
     for _ in range(30):
         gains = drawn_gains(draw)
@@ -111,7 +111,7 @@ def test_every_term_of_random_controllers_follows_the_law(seed: int) -> None:
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_change_of_gains_keeps_the_output_by_the_integral(seed: int) -> None:
+def test_change_of_gains_keeps_the_output_by_the_integral(seed):
     draw = random.Random(seed)
     for _ in range(40):
         old, new = drawn_gains(draw), drawn_gains(draw)
@@ -139,7 +139,7 @@ def test_change_of_gains_keeps_the_output_by_the_integral(seed: int) -> None:
         assert out.output == pytest.approx(wanted["output"], rel=ROUNDING, abs=ROUNDING)
 
 
-def test_a_refused_step_is_all_nan_but_the_integral_and_leaves_no_trace() -> None:
+def test_a_refused_step_is_all_nan_but_the_integral_and_leaves_no_trace():
     gains = PidGains(p=1.0, i=2.0, d=0.1, feedforward_acceleration=0.1)
     for bad in [(math.nan, 0.0, 0.01), (0.0, math.inf, 0.01), (0.0, 0.0, 0.01, -math.inf),
                 (0.0, 0.0, 0.01, 0.0, math.nan), (0.0, 0.0, 0.01, 0.0, math.inf)]:  # fmt: skip
@@ -156,7 +156,7 @@ def test_a_refused_step_is_all_nan_but_the_integral_and_leaves_no_trace() -> Non
         assert pid.step(1.0, 0.3, 0.01) == calm.step(1.0, 0.3, 0.01)
 
 
-def test_numbers_that_overflow_leave_integral_and_rate_finite() -> None:
+def test_numbers_that_overflow_leave_integral_and_rate_finite():
     pid = Pid(PidGains(p=0.0, i=1e9, d=0.0, u_clamp_min=-12.0, u_clamp_max=12.0))
     for sign in (1.0, -1.0):
         for _ in range(3):
@@ -170,7 +170,7 @@ def test_numbers_that_overflow_leave_integral_and_rate_finite() -> None:
         assert pid.step(0.0, sign * 1e308, 0.1).d_term == 0.0, "an overflowed rate is forgotten"
 
 
-def test_a_controller_that_has_done_nothing_commands_nothing() -> None:
+def test_a_controller_that_has_done_nothing_commands_nothing():
     out = Pid(PidGains(p=3.0, i=1.0)).step(9.0, 1.0, 0.0)
     assert out == (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, False)
     pid = Pid(PidGains(p=3.0, i=1.0))
@@ -181,7 +181,7 @@ def test_a_controller_that_has_done_nothing_commands_nothing() -> None:
     assert pid.i_term == 0.0 and pid.step(9.0, 1.0, 0.0).i_term == 0.0
 
 
-def test_gains_that_change_before_the_first_step_leave_the_integral_empty() -> None:
+def test_gains_that_change_before_the_first_step_leave_the_integral_empty():
     pid = Pid(PidGains(p=1.0, i=1.0))
     pid.set_gains(PidGains(p=5.0, i=1.0, setpoint_weight_d=1.0))
     assert pid.i_term == 0.0
@@ -189,7 +189,7 @@ def test_gains_that_change_before_the_first_step_leave_the_integral_empty() -> N
     assert pid.step(2.0, 1.0, 0.1).p_term == 5.0
 
 
-def test_an_integral_gain_below_the_minimum_counts_as_zero() -> None:
+def test_an_integral_gain_below_the_minimum_counts_as_zero():
     for gain, grows in ((EPSILON, False), (-EPSILON, False), (3 * EPSILON, True)):
         gains = PidGains(p=0.0, i=gain, u_clamp_max=1.0, antiwindup_strategy="back_calculation",
                          tracking_time_constant=1.0, feedforward_velocity=1.0)  # fmt: skip
@@ -202,7 +202,7 @@ def test_an_integral_gain_below_the_minimum_counts_as_zero() -> None:
     assert pid.i_term == 0.0
 
 
-def test_the_default_of_the_tracking_time_constant_is_that_of_the_literature() -> None:
+def test_the_default_of_the_tracking_time_constant_is_that_of_the_literature():
     # Astrom and Hagglund: the square root of Ti Td, or Ti without derivative.
     cases = [({"p": 3.0, "i": 12.0}, 0.25), ({"p": 3.0, "i": 2.0, "d": 0.5}, 0.5),
              ({"p": 3.0, "i": 2.0, "d": 0.5, "tracking_time_constant": 7.0}, 7.0),
@@ -212,13 +212,13 @@ def test_the_default_of_the_tracking_time_constant_is_that_of_the_literature() -
 
 
 @pytest.mark.parametrize("name", ["u_clamp_min", "u_clamp_max", "i_clamp_min", "i_clamp_max"])
-def test_a_clamp_may_be_infinite_and_no_other_number(name: str) -> None:
+def test_a_clamp_may_be_infinite_and_no_other_number(name):
     value = -math.inf if name.endswith("min") else math.inf
     assert getattr(PidGains(**{name: value}), name) == value
     PidGains(i_clamp_min=0.0, i_clamp_max=0.0)
 
 
-def test_the_unsupported_strategy_is_refused_with_its_replacement() -> None:
+def test_the_unsupported_strategy_is_refused_with_its_replacement():
     with pytest.raises(ValueError, match="'legacy' is not offered: use 'none'"):
         PidGains(antiwindup_strategy="legacy")
     with pytest.raises(ValueError, match="must be one of none"):

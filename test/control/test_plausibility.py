@@ -39,7 +39,7 @@ def driven(speeds, drive=DRIVE) -> tuple[WheelController, list[bool]]:
     return wheel, out[len(quiet_before) :]
 
 
-def test_a_reading_that_jumps_is_left_out_and_two_that_agree_are_not() -> None:
+def test_a_reading_that_jumps_is_left_out_and_two_that_agree_are_not():
     """A motor cannot change by half of its top speed within a sample, but a collision can."""
     for readings, out in (([4.9, 0.0], [False, False]), ([5.2, 0.2], [True, False]),
                           ([-9.0, -8.9, -8.9], [True, False, False])):  # fmt: skip
@@ -48,17 +48,17 @@ def test_a_reading_that_jumps_is_left_out_and_two_that_agree_are_not() -> None:
         assert wheel.refused["feedback speed that jumps"] == sum(out)
 
 
-def test_outliers_in_one_of_a_hundred_readings_are_all_left_out() -> None:
+def test_outliers_in_one_of_a_hundred_readings_are_all_left_out():
     readings = np.where(np.arange(3000) % 100 == 0, 8.0, 0.0)
     assert np.array_equal(driven(readings)[1], readings > 0.0)
 
 
-def test_nothing_jumps_where_the_drive_is_not_known() -> None:
+def test_nothing_jumps_where_the_drive_is_not_known():
     assert not any(driven([0.0, 5.2, 0.2, -9.0, 9.0], drive=None)[1])
 
 
 @pytest.mark.parametrize("steps", [6.0, 11.0])
-def test_readings_in_coarse_steps_jump_all_the_time_and_are_believed(steps: float) -> None:
+def test_readings_in_coarse_steps_jump_all_the_time_and_are_believed(steps):
     """As of counts differenced over one sample: zero or one."""
     rng = np.random.default_rng(1)
     wheel, left_out = driven(steps * (rng.random(2000) < 0.3))
@@ -68,7 +68,7 @@ def test_readings_in_coarse_steps_jump_all_the_time_and_are_believed(steps: floa
 
 @pytest.mark.parametrize(("source", "window"), [("measured", 1), ("difference", 2)])
 @pytest.mark.parametrize(("counts", "jumps"), [(1, 0), (3, 1)])
-def test_the_first_counts_of_a_coarse_encoder_are_no_jumps(source, window, counts, jumps) -> None:
+def test_the_first_counts_of_a_coarse_encoder_are_no_jumps(source, window, counts, jumps):
     """One of eight counts in 10 ms is 79 rad/s, over two samples 39, and the top speed 10."""
     quantum = 2 * np.pi / 8
     loop = LoopSettings(gains=GAINS, drive=DRIVE, speed_source=source, difference_window=window)

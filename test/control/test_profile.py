@@ -27,7 +27,7 @@ from smp_motor_control.reference.time_optimal import VoltageLimited
 REST = Reference(0.0, 0.0, 0.0)
 
 
-def test_minimum_jerk_has_its_stated_peaks() -> None:
+def test_minimum_jerk_has_its_stated_peaks():
     transition = MinimumJerk(Reference(1.0, 0.0, 0.0), 4.0, 0.2)
     seen = [transition.at(t) for t in np.linspace(0.0, 0.2, 20001)]
     # The grid misses a parabola's top by (1/40000)^2 at most.
@@ -35,7 +35,7 @@ def test_minimum_jerk_has_its_stated_peaks() -> None:
     assert max(x.jerk for x in seen) == pytest.approx(PEAK_JERK * 3.0 / 0.2**2, rel=1e-6)
 
 
-def test_minimum_jerk_meets_its_six_boundary_conditions() -> None:
+def test_minimum_jerk_meets_its_six_boundary_conditions():
     start = Reference(1.0, -3.0, 40.0)
     transition = MinimumJerk(start, 4.0, 0.2)
     tiny = 1e-9
@@ -44,7 +44,7 @@ def test_minimum_jerk_meets_its_six_boundary_conditions() -> None:
     assert transition.at(0.2) == Reference(4.0, 0.0, 0.0)
 
 
-def test_wheels_with_different_steps_arrive_at_the_same_instant() -> None:
+def test_wheels_with_different_steps_arrive_at_the_same_instant():
     profiles = [Profile(transition_time=0.15) for _ in range(3)]
     for profile, target in zip(profiles, (0.1, -2.0, 5.0), strict=True):
         profile.set_target(target)
@@ -59,7 +59,7 @@ def test_wheels_with_different_steps_arrive_at_the_same_instant() -> None:
     assert [profile.now.velocity for profile in profiles] == [0.1, -2.0, 5.0]
 
 
-def test_limit_stretches_the_transition_just_enough() -> None:
+def test_limit_stretches_the_transition_just_enough():
     limits = ProfileLimits(acceleration=10.0)
     profile = Profile(limits, transition_time=0.15)
     profile.set_target(4.0)
@@ -79,9 +79,7 @@ targets = st.lists(st.tuples(st.floats(-6.0, 6.0), st.integers(1, 80)), min_size
 @pytest.mark.parametrize("transition_time", [0.0, 0.15])
 @given(targets=targets)
 @example(targets=[(-3.0, 47), (-4.53125, 62), (-5.0, 42), (-1.65625, 52), (0.0, 8), (-5.0, 32)])
-def test_reference_keeps_its_limits_through_any_change_of_mind(
-    transition_time: float, targets: list
-) -> None:
+def test_reference_keeps_its_limits_through_any_change_of_mind(transition_time, targets):
     limits = ProfileLimits(velocity=5.0, acceleration=30.0, jerk=600.0)
     profile = Profile(limits, transition_time)
     dt = 0.002
@@ -99,7 +97,7 @@ def test_reference_keeps_its_limits_through_any_change_of_mind(
     assert profile.now == Reference(min(max(targets[-1][0], -5.0), 5.0), 0.0, 0.0)
 
 
-def test_fastest_transition_within_limits_is_as_fast_as_the_formula() -> None:
+def test_fastest_transition_within_limits_is_as_fast_as_the_formula():
     profile = Profile(ProfileLimits(acceleration=10.0, jerk=100.0))
     profile.set_target(4.0)
     elapsed = 0.0
@@ -109,7 +107,7 @@ def test_fastest_transition_within_limits_is_as_fast_as_the_formula() -> None:
     assert elapsed == pytest.approx(4.0 / 10.0 + 10.0 / 100.0, abs=0.0011)  # D/a + a/j, one step
 
 
-def test_retargeting_half_way_keeps_velocity_acceleration_and_jerk() -> None:
+def test_retargeting_half_way_keeps_velocity_acceleration_and_jerk():
     profile = Profile(transition_time=0.2)
     profile.set_target(4.0)
     for _ in range(80):
@@ -123,7 +121,7 @@ def test_retargeting_half_way_keeps_velocity_acceleration_and_jerk() -> None:
     assert profile.now == Reference(-1.0, 0.0, 0.0)
 
 
-def test_repeated_target_does_not_start_again() -> None:
+def test_repeated_target_does_not_start_again():
     profile = Profile(transition_time=0.1)
     for _ in range(101):
         profile.set_target(2.0)
@@ -131,13 +129,13 @@ def test_repeated_target_does_not_start_again() -> None:
     assert profile.now == Reference(2.0, 0.0, 0.0)
 
 
-def test_without_limits_the_reference_jumps() -> None:
+def test_without_limits_the_reference_jumps():
     profile = Profile()
     profile.set_target(3.0)
     assert profile.step(0.001) == Reference(3.0, 0.0, 0.0)
 
 
-def test_looking_ahead_moves_nothing() -> None:
+def test_looking_ahead_moves_nothing():
     profile = Profile(transition_time=0.1)
     profile.set_target(2.0)
     profile.step(0.02)
@@ -147,7 +145,7 @@ def test_looking_ahead_moves_nothing() -> None:
 
 
 @pytest.mark.parametrize("bad", [math.nan, math.inf])
-def test_target_that_is_not_finite_leaves_the_old_one(bad: float) -> None:
+def test_target_that_is_not_finite_leaves_the_old_one(bad):
     profile = Profile(transition_time=0.1)
     profile.set_target(2.0)
     with pytest.raises(ParameterError, match="target"):
@@ -155,7 +153,7 @@ def test_target_that_is_not_finite_leaves_the_old_one(bad: float) -> None:
     assert profile.target == 2.0
 
 
-def test_parameters_of_zero_mean_no_limit() -> None:
+def test_parameters_of_zero_mean_no_limit():
     zeros = dict.fromkeys(("max_velocity", "max_acceleration", "max_jerk"), 0.0)
     assert settings_of(ProfileLimits, zeros) == ProfileLimits()
 
@@ -178,8 +176,8 @@ drives = st.builds(
     st.sampled_from([0.001, 0.005, 0.01]),
 )
 def test_a_change_as_fast_as_voltage_allows_ends_at_rest_within_it(
-    drive: Drive, bend: float, begin: float, end: float, push: float, dt: float
-) -> None:
+    drive, bend, begin, end, push, dt
+):
     if bend > 0.001:
         drive = replace(drive, time_constant_product=bend * drive.time_constant**2)
     top, tau = drive.top_speed, drive.time_constant
@@ -199,14 +197,14 @@ def test_a_change_as_fast_as_voltage_allows_ends_at_rest_within_it(
         assert max(abs(drive.needed(x)) for x in seen) <= top * (1 + 1e-6)
 
 
-def test_a_first_order_motor_gets_the_time_of_the_textbook() -> None:
+def test_a_first_order_motor_gets_the_time_of_the_textbook():
     drive = Drive(top_speed=10.0, time_constant=0.1)
     change = VoltageLimited(REST, 5.0, drive, 1e-4)
     # w = U (1 - exp(-t / tau)), rounded up to samples.
     assert 0.1 * math.log(2.0) <= change.duration <= 0.1 * math.log(2.0) + 1e-4
 
 
-def test_no_voltage_within_the_limit_is_faster() -> None:
+def test_no_voltage_within_the_limit_is_faster():
     drive = Drive(top_speed=10.0, time_constant=0.05, time_constant_product=0.0008)
     dt, target = 0.005, 6.0
     samples = round(VoltageLimited(REST, target, drive, dt).duration / dt)
@@ -223,7 +221,7 @@ def test_no_voltage_within_the_limit_is_faster() -> None:
         assert found.success == possible
 
 
-def test_a_small_change_takes_the_transition_time_and_a_large_one_is_limited_by_voltage() -> None:
+def test_a_small_change_takes_the_transition_time_and_a_large_one_is_limited_by_voltage():
     drive = Drive(top_speed=10.0, time_constant=0.05, time_constant_product=0.0008)
     profile = Profile(transition_time=0.05, drive=drive)
     durations = []
@@ -235,7 +233,7 @@ def test_a_small_change_takes_the_transition_time_and_a_large_one_is_limited_by_
     assert durations[1] == pytest.approx(0.1)  # 20 samples
 
 
-def test_an_acceleration_limit_holds_in_addition_to_the_voltage() -> None:
+def test_an_acceleration_limit_holds_in_addition_to_the_voltage():
     drive = Drive(top_speed=10.0, time_constant=0.05, time_constant_product=0.0008)
     profile = Profile(ProfileLimits(acceleration=40.0), transition_time=0.05, drive=drive)
     profile.set_target(8.0, 0.005)
@@ -244,7 +242,7 @@ def test_an_acceleration_limit_holds_in_addition_to_the_voltage() -> None:
     assert max(drive.needed(x) for x in seen) <= 1.001 * 10.0
 
 
-def test_a_limit_lowered_on_the_way_lets_the_acceleration_only_fall() -> None:
+def test_a_limit_lowered_on_the_way_lets_the_acceleration_only_fall():
     profile = Profile(ProfileLimits(acceleration=30.0, jerk=600.0), transition_time=0.15)
     profile.set_target(3.0)
     for _ in range(30):

@@ -11,9 +11,7 @@ from smp_motor_control.wheel.protection import Bounds, Protection
 
 
 @pytest.mark.parametrize(("what", "words"), [("speed", "turns at 20"), ("current", "is 20 A")])
-def test_one_bad_sample_stops_nothing_and_a_twentieth_of_a_second_does(
-    what: str, words: str
-) -> None:
+def test_one_bad_sample_stops_nothing_and_a_twentieth_of_a_second_does(what, words):
     def sample(k: int, value: float) -> tuple[float, float, float]:
         current, speed = (0.1, value) if what == "speed" else (value, 1.0)
         return 1e9 + 0.01 * k, current, speed
@@ -26,7 +24,7 @@ def test_one_bad_sample_stops_nothing_and_a_twentieth_of_a_second_does(
     assert not any(said[:5]) and words in said[-1]
 
 
-def test_without_limits_or_a_sensor_of_current_nothing_is_judged() -> None:
+def test_without_limits_or_a_sensor_of_current_nothing_is_judged():
     for bounds in (Bounds(), Bounds(current=1.0)):
         watched = Protection(bounds)
         assert not any(watched.add(1e9 + 0.01 * k, math.nan, 1e3) for k in range(4000))

@@ -74,7 +74,7 @@ def losing(share: float, since: float = 3.0) -> Callable[[Sample, float], Sample
 
 @pytest.mark.parametrize("share", [0.2, 0.3])
 @pytest.mark.parametrize(("gains", "since"), [(GAINS, 3.0), (FED_FORWARD, 0.0)])
-def test_an_encoder_that_loses_counts_is_suspected(gains, since, share) -> None:
+def test_an_encoder_that_loses_counts_is_suspected(gains, since, share):
     """linorobot/linorobot2 issue 154: "one of my encoder broken, so pid try to correct it"."""
     wheel = Wheel(LoopSettings(gains=gains), see=losing(share, since)).drive(5.0, 10.0)
     assert wheel.state is State.DRIVING and wheel.overload is not None
@@ -83,7 +83,7 @@ def test_an_encoder_that_loses_counts_is_suspected(gains, since, share) -> None:
 
 
 @pytest.mark.parametrize("share", [0.0, 0.05])
-def test_an_encoder_that_shows_nothing_stops_the_wheel(share) -> None:
+def test_an_encoder_that_shows_nothing_stops_the_wheel(share):
     """sonyccd/roboclaw_ros issue 4: no encoder, full PWM."""
     wheel = Wheel(see=losing(share, 0.0)).drive(5.0, 5.0)
     assert wheel.recovery.fault in (Fault.NO_MOTION, Fault.NOT_FOLLOWING)
@@ -91,7 +91,7 @@ def test_an_encoder_that_shows_nothing_stops_the_wheel(share) -> None:
 
 @pytest.mark.parametrize("target", [0.1, 1.0, 5.0, 15.0, 25.0])
 @pytest.mark.parametrize("gains", [GAINS, FED_FORWARD])
-def test_a_sound_wheel_is_not_suspected(gains, target) -> None:
+def test_a_sound_wheel_is_not_suspected(gains, target):
     wheel = Wheel(LoopSettings(gains=gains)).drive(target, 8.0)
     assert wheel.overload is None and wheel.recovery.failures == 0
 
@@ -100,7 +100,7 @@ def test_a_sound_wheel_is_not_suspected(gains, target) -> None:
 @pytest.mark.parametrize(
     ("source", "window"), [("measured", 4), ("difference", 4), ("difference", 1)]
 )
-def test_a_counter_that_wraps_against_its_description_is_unwrapped(source, window, bits) -> None:
+def test_a_counter_that_wraps_against_its_description_is_unwrapped(source, window, bits):
     """AIRclub-UdeSA/physical_rosmaster pull request 1: counters subtracted as they are."""
     gains = LoopSettings(gains=GAINS, speed_source=source, difference_window=window)
     one = Wheel(gains, counts=48.0 if bits == 8 else 4000.0, bits=bits, described_bits=0)
@@ -109,7 +109,7 @@ def test_a_counter_that_wraps_against_its_description_is_unwrapped(source, windo
     assert wheel.recovery.failures == 0 and wheel.loop.wraps_at == bits
 
 
-def test_steps_that_are_no_wraps_tell_no_width() -> None:
+def test_steps_that_are_no_wraps_tell_no_width():
     width = CounterWidth()
     counts = [0, 100, 205, 300, 100, -156, -420, -700, 40_000, 40_010, 40_021, -25_530]
     assert [width.step(count) for count in counts[:-1]] == [0] * 11
@@ -119,7 +119,7 @@ def test_steps_that_are_no_wraps_tell_no_width() -> None:
 
 @pytest.mark.parametrize("target", [0.005, 0.02, 0.1, 0.2])
 @pytest.mark.parametrize(("counts", "rate"), [(48.0, 100.0), (12.0, 50.0), (8.0, 20.0)])
-def test_a_wheel_near_zero_does_not_rocket_away(counts, rate, target) -> None:
+def test_a_wheel_near_zero_does_not_rocket_away(counts, rate, target):
     """RoverRobotics-archive/roverrobotics_ros2 issue 4: near zero it drives off at top speed."""
     one = Wheel(counts=counts, rate=rate)
     wheel = one.drive(target, 20.0)
@@ -128,7 +128,7 @@ def test_a_wheel_near_zero_does_not_rocket_away(counts, rate, target) -> None:
 
 
 @pytest.mark.parametrize("window", [1, 10])
-def test_pulses_that_come_one_by_one_drive_at_the_mean_that_is_asked(window) -> None:
+def test_pulses_that_come_one_by_one_drive_at_the_mean_that_is_asked(window):
     """waveshareteam/ugv_base_ros pull request 11: 0 or 1 pulse a tick, it cogs and stalls."""
     slow = LoopSettings(gains=GAINS, speed_source="difference", difference_window=window)
     one = Wheel(slow, counts=44.0, rate=200.0)
@@ -136,7 +136,7 @@ def test_pulses_that_come_one_by_one_drive_at_the_mean_that_is_asked(window) -> 
     assert one.mean == pytest.approx(0.25, rel=0.1) and wheel.recovery.failures == 0
 
 
-def test_gains_for_10_hz_of_two_unlike_motors_follow() -> None:
+def test_gains_for_10_hz_of_two_unlike_motors_follow():
     """ros-mobile-robots/diffbot issue 13: F 0.8, P 0.35, I 0.5, D 0.01, clamped, at 10 Hz."""
     gains = PidGains(p=0.35, i=0.5, d=0.01, feedforward_velocity=0.8, i_clamp_min=-3.5,
                      i_clamp_max=3.5, u_clamp_min=-6.0, u_clamp_max=6.0)  # fmt: skip

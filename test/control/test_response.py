@@ -26,7 +26,7 @@ def by_exponential(tau: float, tp: float, t: float) -> np.ndarray:
 
 @pytest.mark.parametrize("share", SHARES)
 @pytest.mark.parametrize("interval", [1e-4, 1e-3, 0.02])
-def test_held_response_is_the_matrix_exponential(share: float, interval: float) -> None:
+def test_held_response_is_the_matrix_exponential(share, interval):
     tp = share * TAU**2
     held = zero_order_hold(GAIN, TAU, tp, interval)
     truth = by_exponential(TAU, tp, interval)
@@ -41,7 +41,7 @@ def test_held_response_is_the_matrix_exponential(share: float, interval: float) 
 
 
 @pytest.mark.parametrize("share", [*SHARES, 0.0])
-def test_scalar_and_batched_response_are_the_same(share: float) -> None:
+def test_scalar_and_batched_response_are_the_same(share):
     times = np.geomspace(1e-5, 3.0, 30)
     held = zero_order_hold(GAIN, TAU, share * TAU**2, times)
     free = FreeResponse(TAU, share * TAU**2)
@@ -50,7 +50,7 @@ def test_scalar_and_batched_response_are_the_same(share: float) -> None:
         assert held.transition[k].ravel() == pytest.approx([g, h, g_rate, h_rate], rel=1e-12)
 
 
-def test_a_decayed_pole_leaves_the_motor_of_first_order() -> None:
+def test_a_decayed_pole_leaves_the_motor_of_first_order():
     # With L/R of 1 ns and 50 ms the two differ by their ratio, 2e-8.
     second = zero_order_hold(GAIN, TAU, 1e-9 * TAU, 0.05)
     first = zero_order_hold(GAIN, TAU, 0.0, 0.05)

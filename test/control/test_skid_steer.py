@@ -24,7 +24,7 @@ ROUNDING = 1e-9
 
 
 @given(v=st.floats(-3.0, 3.0), w=st.floats(-6.0, 6.0))
-def test_path_keeps_its_shape_when_a_wheel_cannot_follow(v: float, w: float) -> None:
+def test_path_keeps_its_shape_when_a_wheel_cannot_follow(v, w):
     left, right = ROBOT.reachable_wheel_speeds(v, w)
     assert max(abs(left), abs(right)) <= 3.0 * (1.0 + ROUNDING)
     linear, angular = ROBOT.body_velocity(left, right)
@@ -33,11 +33,11 @@ def test_path_keeps_its_shape_when_a_wheel_cannot_follow(v: float, w: float) -> 
     assert linear * v >= 0.0
 
 
-def test_command_within_reach_is_not_touched() -> None:
+def test_command_within_reach_is_not_touched():
     assert ROBOT.reachable_wheel_speeds(0.1, 0.2) == ROBOT.wheel_speeds(0.1, 0.2)
 
 
-def test_radius_multipliers_act_on_their_side() -> None:
+def test_radius_multipliers_act_on_their_side():
     robot = SkidSteer(
         wheel_separation=0.4,
         wheel_radius=0.1,
@@ -47,13 +47,13 @@ def test_radius_multipliers_act_on_their_side() -> None:
     assert robot.wheel_speeds(1.0, 0.0) == pytest.approx((20.0, 5.0))
 
 
-def test_sides_hold_the_wheels_of_the_contract() -> None:
+def test_sides_hold_the_wheels_of_the_contract():
     assert LEFT == ("front_left", "rear_left")
     assert RIGHT == ("front_right", "rear_right")
 
 
 @pytest.mark.parametrize("bad", [math.nan, math.inf])
-def test_limiter_lets_nothing_through_that_is_not_finite(bad: float) -> None:
+def test_limiter_lets_nothing_through_that_is_not_finite(bad):
     with pytest.raises(ParameterError, match="finite"):
         SpeedLimiter(max_velocity=1.0).limit(bad, 0.0, 0.0, 0.1)
 
@@ -70,7 +70,7 @@ def test_limiter_lets_nothing_through_that_is_not_finite(bad: float) -> None:
         {"min_jerk": 0.1, "max_jerk": 1.0},
     ],
 )
-def test_limits_with_which_a_body_cannot_stand_are_refused(limits: dict[str, float]) -> None:
+def test_limits_with_which_a_body_cannot_stand_are_refused(limits):
     with pytest.raises(ParameterError, match="enclose zero"):
         SpeedLimiter(**limits)
 
@@ -79,7 +79,7 @@ def make_odometry(**more: float) -> Odometry:
     return Odometry(wheel_separation=0.5, left_radius=0.1, right_radius=0.1, **more)
 
 
-def test_covariance_agrees_with_a_thousand_noisy_drives() -> None:
+def test_covariance_agrees_with_a_thousand_noisy_drives():
     travel_noise, turn_noise, steps, drives = 4e-4, 1e-2, 100, 1000
     rng = np.random.default_rng(5)
     # Every step: left 9 mm, right 11 mm, each with a variance of travel_noise per metre, and
@@ -109,7 +109,7 @@ def test_covariance_agrees_with_a_thousand_noisy_drives() -> None:
     assert predicted / np.outer(std, std) == pytest.approx(sampled / np.outer(std, std), abs=0.2)
 
 
-def test_heading_hold_straightens_a_body_that_drifts() -> None:
+def test_heading_hold_straightens_a_body_that_drifts():
     hold, yaw, dt = HeadingHold(p=2.0, i=1.0), 0.0, 0.02
     for _ in range(1000):
         command = hold.step(0.0, yaw, dt)
@@ -118,7 +118,7 @@ def test_heading_hold_straightens_a_body_that_drifts() -> None:
     assert command == pytest.approx(-0.1, abs=1e-3)
 
 
-def test_a_speed_that_is_to_be_held_is_held_whatever_the_jerk() -> None:
+def test_a_speed_that_is_to_be_held_is_held_whatever_the_jerk():
     limiter = SpeedLimiter(max_jerk=1.0)
     assert limiter.limit_jerk(1.0, v0=1.0, v1=0.5, dt=0.1).value == 1.0
     assert limiter.limit_jerk(1.1, v0=1.0, v1=0.9, dt=0.1).value == pytest.approx(1.1)
@@ -126,7 +126,7 @@ def test_a_speed_that_is_to_be_held_is_held_whatever_the_jerk() -> None:
 
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])
-def test_a_saturated_heading_integral_unwinds_as_soon_as_the_error_turns(sign: float) -> None:
+def test_a_saturated_heading_integral_unwinds_as_soon_as_the_error_turns(sign):
     hold = HeadingHold(p=0.0, i=2.0, max_correction=0.5, max_error=3.0)
     hold.step(0.0, yaw=0.0, dt=0.05)
     for _ in range(100):
@@ -138,7 +138,7 @@ def test_a_saturated_heading_integral_unwinds_as_soon_as_the_error_turns(sign: f
     assert after[-1] == -0.5 * sign, "and winds up the other way"
 
 
-def test_heading_hold_follows_a_commanded_turn_across_the_wrap() -> None:
+def test_heading_hold_follows_a_commanded_turn_across_the_wrap():
     hold, yaw, dt = HeadingHold(p=2.0, i=0.5), 3.0, 0.02
     for _ in range(500):
         yaw = math.remainder(yaw + 0.9 * hold.step(0.5, yaw, dt) * dt, 2.0 * math.pi)
@@ -146,14 +146,14 @@ def test_heading_hold_follows_a_commanded_turn_across_the_wrap() -> None:
     assert math.remainder(yaw - 3.0 - 5.0, 2.0 * math.pi) == pytest.approx(0.0, abs=0.02)
 
 
-def test_heading_hold_gives_in_when_the_body_is_turned_by_hand() -> None:
+def test_heading_hold_gives_in_when_the_body_is_turned_by_hand():
     hold = HeadingHold(max_error=0.7)
     hold.step(0.0, 0.0, 0.02)
     assert hold.step(0.0, 2.0, 0.02) == 0.0
     assert hold.step(0.0, 2.0, 0.02) == 0.0
 
 
-def test_heading_hold_never_corrects_by_more_than_allowed_or_with_nan() -> None:
+def test_heading_hold_never_corrects_by_more_than_allowed_or_with_nan():
     hold = HeadingHold(p=10.0, i=10.0, max_correction=0.3)
     hold.step(0.0, 0.0, 0.02)
     for _ in range(100):

@@ -24,7 +24,7 @@ def feed(
         feedback.receive(wheel, WheelSample(t, position, velocity), t if now is None else now)
 
 
-def test_wheels_that_report_at_different_instants_count_once() -> None:
+def test_wheels_that_report_at_different_instants_count_once():
     feedback = make()
     feed(feedback, 0.0, "abcd", 0.0)
     feedback.take(0.0, TIMEOUT)
@@ -37,13 +37,13 @@ def test_wheels_that_report_at_different_instants_count_once() -> None:
     assert total == pytest.approx([0.995, 0.99])
 
 
-def test_first_reading_adds_no_motion() -> None:
+def test_first_reading_adds_no_motion():
     feedback = make()
     feed(feedback, 0.0, "abcd", 500.0)
     assert feedback.take(0.0, TIMEOUT) is None
 
 
-def test_wheel_that_falls_silent_leaves_the_mean_and_comes_back_without_a_jump() -> None:
+def test_wheel_that_falls_silent_leaves_the_mean_and_comes_back_without_a_jump():
     feedback, total = make(), 0.0
     for k in range(100):
         feed(feedback, 0.1 * k, "acd", 0.1 * k)
@@ -56,7 +56,7 @@ def test_wheel_that_falls_silent_leaves_the_mean_and_comes_back_without_a_jump()
     assert feedback.silent(9.9, TIMEOUT) == {} and total == pytest.approx(9.9)
 
 
-def test_silence_of_a_whole_side_is_told_and_not_guessed() -> None:
+def test_silence_of_a_whole_side_is_told_and_not_guessed():
     feedback = make()
     feed(feedback, 0.0, "abcd", 0.0)
     feedback.take(0.0, TIMEOUT)
@@ -71,7 +71,7 @@ def test_silence_of_a_whole_side_is_told_and_not_guessed() -> None:
     [(0.02, 1e9), (0.02, -1e300), (-5.0, 1.0), (0.01, 1.0)],
     ids=["counter reset", "absurd", "time jumped back", "duplicate"],
 )
-def test_impossible_sample_adds_no_motion(stamp: float, position: float) -> None:
+def test_impossible_sample_adds_no_motion(stamp, position):
     feedback = make()
     feed(feedback, 0.0, "abcd", 0.0)
     feedback.take(0.0, TIMEOUT)
@@ -83,7 +83,7 @@ def test_impossible_sample_adds_no_motion(stamp: float, position: float) -> None
     assert feedback.take(0.04, TIMEOUT) is not None
 
 
-def test_velocity_stands_in_for_a_position_that_is_nan() -> None:
+def test_velocity_stands_in_for_a_position_that_is_nan():
     feedback = make()
     feed(feedback, 0.0, "abcd", math.nan, 2.0)
     feedback.take(0.0, TIMEOUT)
@@ -92,7 +92,7 @@ def test_velocity_stands_in_for_a_position_that_is_nan() -> None:
 
 
 @pytest.mark.parametrize("stall", [0.1, 0.12, 0.5, 1.0])
-def test_speed_over_a_stall_is_the_travel_over_the_time_it_was_travelled_in(stall: float) -> None:
+def test_speed_over_a_stall_is_the_travel_over_the_time_it_was_travelled_in(stall):
     feedback = make()
     stamps = [0.005 * k for k in range(100)]
     stamps += [0.5 + stall + 0.005 * k for k in range(100)]
@@ -108,7 +108,7 @@ def test_speed_over_a_stall_is_the_travel_over_the_time_it_was_travelled_in(stal
     assert speeds[2:] == pytest.approx([3.0] * (len(speeds) - 2))
 
 
-def test_non_finite_sample_does_not_reset_the_time_out() -> None:
+def test_non_finite_sample_does_not_reset_the_time_out():
     feedback = make()
     feed(feedback, 0.0, "abcd", 0.0)
     feed(feedback, 1.0, "abcd", math.nan, math.inf)
@@ -145,7 +145,7 @@ def drive(
 @pytest.mark.parametrize("silence", [0.3, 0.8, 4.0])
 @pytest.mark.parametrize("silent", ["a", "ab", "abcd", "ac"])
 @pytest.mark.parametrize("wheels", [("ab", "cd"), ("a", "c")])
-def test_positions_tell_the_way_of_a_silence(silence: float, silent: str, wheels) -> None:
+def test_positions_tell_the_way_of_a_silence(silence, silent, wheels):
     def see(wheel: str, t: float, sample: WheelSample) -> WheelSample | None:
         return None if wheel in silent and 1.0 < t < 1.0 + silence else sample
 
@@ -154,13 +154,13 @@ def test_positions_tell_the_way_of_a_silence(silence: float, silent: str, wheels
     assert not feedback.problems
 
 
-def test_a_wheel_that_is_silent_for_ever_is_taken_to_turn_as_its_side_does() -> None:
+def test_a_wheel_that_is_silent_for_ever_is_taken_to_turn_as_its_side_does():
     left, right, _ = drive(lambda wheel, t, s: None if wheel == "a" else s, seconds=6.0)
     assert (left, right) == pytest.approx((8.0, 16.0), abs=0.01)
 
 
 @pytest.mark.parametrize("spike", [3.0, -50.0, 1e9, -1e300, math.nan])
-def test_position_spikes_cost_no_way(spike: float) -> None:
+def test_position_spikes_cost_no_way(spike):
     def see(wheel: str, t: float, sample: WheelSample) -> WheelSample:
         spoilt = wheel == "a" and round(t * RATE) % 50 == 17
         return sample._replace(position=sample.position + spike) if spoilt else sample
@@ -171,7 +171,7 @@ def test_position_spikes_cost_no_way(spike: float) -> None:
     assert not feedback.problems
 
 
-def test_a_counter_that_is_reset_costs_less_than_a_sample() -> None:
+def test_a_counter_that_is_reset_costs_less_than_a_sample():
     def see(wheel: str, t: float, sample: WheelSample) -> WheelSample:
         return sample._replace(position=sample.position - 40.0) if t > 3.0 else sample
 
@@ -180,7 +180,7 @@ def test_a_counter_that_is_reset_costs_less_than_a_sample() -> None:
     assert "position jumped" in feedback.problems["a"]
 
 
-def test_a_publisher_that_restarted_counts_from_elsewhere() -> None:
+def test_a_publisher_that_restarted_counts_from_elsewhere():
     feedback = WheelFeedback(("a",), ("c",), max_speed=MOST)
     for t, position, restarted in ((0.0, 100.0, False), (0.1, 100.2, False), (30.0, 0.0, True),
                                    (30.1, 0.3, False)):  # fmt: skip
@@ -192,7 +192,7 @@ def test_a_publisher_that_restarted_counts_from_elsewhere() -> None:
 
 @pytest.mark.parametrize("lowest", [0.0, -math.pi])
 @pytest.mark.parametrize("speed", [1.0, -5.0])
-def test_a_position_that_wraps_is_named_and_costs_nothing(lowest: float, speed: float) -> None:
+def test_a_position_that_wraps_is_named_and_costs_nothing(lowest, speed):
     def see(wheel: str, t: float, sample: WheelSample) -> WheelSample:
         return sample._replace(position=(sample.position - lowest) % (2 * math.pi) + lowest)
 
@@ -202,7 +202,7 @@ def test_a_position_that_wraps_is_named_and_costs_nothing(lowest: float, speed: 
     assert "position wraps" in feedback.problems["a"]
 
 
-def test_a_position_that_wraps_elsewhere_costs_no_more_than_the_velocity_tells() -> None:
+def test_a_position_that_wraps_elsewhere_costs_no_more_than_the_velocity_tells():
     def see(wheel: str, t: float, sample: WheelSample) -> WheelSample:
         return sample._replace(position=sample.position % 3.7)
 
@@ -211,7 +211,7 @@ def test_a_position_that_wraps_elsewhere_costs_no_more_than_the_velocity_tells()
     assert "position jumped" in feedback.problems["c"]
 
 
-def test_a_position_that_is_never_filled_is_named_and_the_velocity_tells_the_way() -> None:
+def test_a_position_that_is_never_filled_is_named_and_the_velocity_tells_the_way():
     def see(wheel: str, t: float, sample: WheelSample) -> WheelSample:
         return sample._replace(position=0.0)
 
@@ -228,7 +228,7 @@ def test_a_position_that_is_never_filled_is_named_and_the_velocity_tells_the_way
     assert abs(still) < 0.02 and not feedback.problems, "a wheel that stands is not blamed"
 
 
-def test_late_and_repeated_samples_neither_add_nor_lose_motion() -> None:
+def test_late_and_repeated_samples_neither_add_nor_lose_motion():
     late: dict[str, WheelSample] = {}
 
     def see(wheel: str, t: float, sample: WheelSample) -> WheelSample:
@@ -241,7 +241,7 @@ def test_late_and_repeated_samples_neither_add_nor_lose_motion() -> None:
     assert not feedback.problems
 
 
-def test_a_clock_that_is_set_back_costs_one_sample() -> None:
+def test_a_clock_that_is_set_back_costs_one_sample():
     def see(wheel: str, t: float, sample: WheelSample) -> WheelSample:
         return sample._replace(stamp=sample.stamp - 3600.0) if t > 3.0 else sample
 

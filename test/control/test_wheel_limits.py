@@ -54,7 +54,7 @@ class Feed:
         self.wheel.take_setpoint(value, self.now, age)
 
 
-def test_a_set_point_as_old_as_its_time_out_counts_and_an_older_one_does_not() -> None:
+def test_a_set_point_as_old_as_its_time_out_counts_and_an_older_one_does_not():
     for age, counts in ((0.5, True), (0.5 + 2.0**-20, False), (-9.0, True)):
         feed = Feed()
         feed.ask(1.0, age)
@@ -64,7 +64,7 @@ def test_a_set_point_as_old_as_its_time_out_counts_and_an_older_one_does_not() -
 
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])
-def test_a_set_point_up_to_its_limit_counts(sign: float) -> None:
+def test_a_set_point_up_to_its_limit_counts(sign):
     feed = Feed()
     feed.ask(sign * 1.0001e4)
     assert feed.give() == 0.0
@@ -72,7 +72,7 @@ def test_a_set_point_up_to_its_limit_counts(sign: float) -> None:
     assert feed.give() == sign * 12.0
 
 
-def test_a_set_point_holds_for_its_time_out_and_then_the_wheel_is_braked() -> None:
+def test_a_set_point_holds_for_its_time_out_and_then_the_wheel_is_braked():
     feed = Feed()
     feed.ask(1.0)
     for k in range(1, 33):  # half a second
@@ -83,9 +83,7 @@ def test_a_set_point_holds_for_its_time_out_and_then_the_wheel_is_braked() -> No
 
 
 @pytest.mark.parametrize(("transition", "longest"), [(0.0, 1.0), (0.25, 1.0), (60.0, 0.75)])
-def test_a_wheel_that_cannot_be_braked_gets_nothing_after_its_stop_time(
-    transition, longest
-) -> None:
+def test_a_wheel_that_cannot_be_braked_gets_nothing_after_its_stop_time(transition, longest):
     loop = LoopSettings(gains=GAINS, transition_time=transition, stop_time=longest)
     feed = Feed(replace(SETTINGS, loop=loop))
     feed.ask(1.0)
@@ -98,7 +96,7 @@ def test_a_wheel_that_cannot_be_braked_gets_nothing_after_its_stop_time(
 
 
 @pytest.mark.parametrize(("speed", "at_rest"), [(0.049, True), (-0.049, True), (0.05, False)])
-def test_a_wheel_at_rest_needs_no_brake(speed: float, at_rest: bool) -> None:
+def test_a_wheel_at_rest_needs_no_brake(speed, at_rest):
     feed = Feed()
     feed.ask(0.0)
     while feed.wheel.state is not State.TIMED_OUT:
@@ -106,7 +104,7 @@ def test_a_wheel_at_rest_needs_no_brake(speed: float, at_rest: bool) -> None:
     assert (voltage == 0.0) is at_rest
 
 
-def test_a_wheel_that_is_braked_along_its_profile_is_not_let_go_before_its_end() -> None:
+def test_a_wheel_that_is_braked_along_its_profile_is_not_let_go_before_its_end():
     gains = replace(GAINS, p=1.0, feedforward_velocity=1.0)
     feed = Feed(replace(SETTINGS, loop=LoopSettings(gains=gains, transition_time=0.5)))
     feed.ask(1.0)
@@ -116,7 +114,7 @@ def test_a_wheel_that_is_braked_along_its_profile_is_not_let_go_before_its_end()
     assert feed.give(0.0) > 0.5
 
 
-def test_silence_up_to_the_time_out_is_tolerated_and_a_longer_one_is_named() -> None:
+def test_silence_up_to_the_time_out_is_tolerated_and_a_longer_one_is_named():
     feed = Feed()
     feed.ask(1.0)
     feed.give()
@@ -141,7 +139,7 @@ def test_silence_up_to_the_time_out_is_tolerated_and_a_longer_one_is_named() -> 
         assert feed.wheel.state is State.NO_FEEDBACK
 
 
-def test_after_silence_the_loop_starts_anew_from_the_speed_that_is() -> None:
+def test_after_silence_the_loop_starts_anew_from_the_speed_that_is():
     loop = LoopSettings(gains=replace(GAINS, i=64.0), transition_time=1.0)
     for gap in ("silence", "late", "owner", "bad", "reset"):
         feed = Feed(replace(SETTINGS, loop=loop))
@@ -174,7 +172,7 @@ def test_after_silence_the_loop_starts_anew_from_the_speed_that_is() -> None:
         assert abs(feed.wheel.loop.pid.i_term) < 0.1
 
 
-def test_speeds_up_to_the_implausible_count_in_both_directions() -> None:
+def test_speeds_up_to_the_implausible_count_in_both_directions():
     for sign in (1.0, -1.0):
         feed = Feed()
         feed.ask(0.0)
@@ -183,7 +181,7 @@ def test_speeds_up_to_the_implausible_count_in_both_directions() -> None:
         assert feed.wheel.refused == {"feedback velocity that is not a number or implausible": 1}
 
 
-def test_a_count_that_jumps_is_left_out_and_the_speed_begins_anew() -> None:
+def test_a_count_that_jumps_is_left_out_and_the_speed_begins_anew():
     loop = LoopSettings(gains=GAINS, speed_source="difference", difference_window=1)
     feed = Feed(replace(SETTINGS, loop=loop))
     feed.wheel.set_hardware(Gearbox(1.0), Encoder(64.0), 12.0)
@@ -202,7 +200,7 @@ def test_a_count_that_jumps_is_left_out_and_the_speed_begins_anew() -> None:
     assert feed.wheel.state is State.BAD_FEEDBACK
 
 
-def test_a_clock_that_jumps_begins_the_counted_speed_anew() -> None:
+def test_a_clock_that_jumps_begins_the_counted_speed_anew():
     loop = LoopSettings(gains=GAINS, speed_source="difference", difference_window=1)
     feed = Feed(replace(SETTINGS, loop=loop))
     feed.wheel.set_hardware(Gearbox(1.0), Encoder(64.0), 12.0)
@@ -214,7 +212,7 @@ def test_a_clock_that_jumps_begins_the_counted_speed_anew() -> None:
     assert feed.give(encoder_count=1, age=60.0) == 0.0
 
 
-def test_a_wheel_at_fault_answers_every_sample_with_zero() -> None:
+def test_a_wheel_at_fault_answers_every_sample_with_zero():
     feed = Feed()
     feed.ask(1.0)
     assert feed.give() == 2.0
@@ -225,7 +223,7 @@ def test_a_wheel_at_fault_answers_every_sample_with_zero() -> None:
         assert feed.wheel.state is State.FAULT
 
 
-def test_a_non_finite_voltage_is_replaced_by_the_command() -> None:
+def test_a_non_finite_voltage_is_replaced_by_the_command():
     feed = Feed()
     seen: list[float] = []
     feed.wheel.loop.speed = lambda dt, velocity, count, voltage: seen.append(voltage) or velocity
@@ -236,7 +234,7 @@ def test_a_non_finite_voltage_is_replaced_by_the_command() -> None:
     assert seen == [7.0, 2.0, 1.0, -3.0]
 
 
-def test_of_a_gap_between_samples_no_more_than_a_tenth_of_a_second_is_evidence() -> None:
+def test_of_a_gap_between_samples_no_more_than_a_tenth_of_a_second_is_evidence():
     limits = replace(NO_FAULTS, stall_time=0.5, stall_voltage=4.0)
     feed, found = Feed(replace(SETTINGS, faults=limits)), []
     for _ in range(12):
@@ -247,7 +245,7 @@ def test_of_a_gap_between_samples_no_more_than_a_tenth_of_a_second_is_evidence()
     assert found.index(Fault.NO_MOTION) == 5
 
 
-def test_the_stall_voltage_is_the_one_that_is_set() -> None:
+def test_the_stall_voltage_is_the_one_that_is_set():
     gains = replace(GAINS, p=1.0, u_clamp_min=-3.0, u_clamp_max=3.0)
     for stall_voltage, named in ((2.0, Fault.NO_MOTION), (4.0, None)):
         limits = replace(NO_FAULTS, stall_time=0.25, stall_voltage=stall_voltage)
@@ -264,7 +262,7 @@ def test_the_stall_voltage_is_the_one_that_is_set() -> None:
     assert changed.wheel.recovery.fault is Fault.NO_MOTION
 
 
-def test_an_inactive_wheel_answers_nothing_and_a_reset_forgets_its_set_point() -> None:
+def test_an_inactive_wheel_answers_nothing_and_a_reset_forgets_its_set_point():
     feed = Feed(active=False)
     feed.ask(1.0)
     assert feed.give() is None and feed.wheel.tick(feed.now + 9.0) is None
@@ -285,7 +283,7 @@ def test_an_inactive_wheel_answers_nothing_and_a_reset_forgets_its_set_point() -
     assert (feed.wheel.output, feed.wheel.answer, feed.wheel.active) == (0.0, None, False)
 
 
-def test_the_terms_of_an_output_are_reported() -> None:
+def test_the_terms_of_an_output_are_reported():
     feed = Feed()
     feed.ask(1.0)
     assert feed.give(0.25) == 1.5
@@ -297,7 +295,7 @@ def test_the_terms_of_an_output_are_reported() -> None:
 
 
 @pytest.mark.parametrize("supply", [0.0, -12.0, math.nan, math.inf])
-def test_an_invalid_supply_is_refused_and_the_old_one_stays(supply: float) -> None:
+def test_an_invalid_supply_is_refused_and_the_old_one_stays(supply):
     feed = Feed()
     feed.wheel.set_hardware(Gearbox(1.0), Encoder(), 5.0)
     with pytest.raises(ValueError, match="supply_voltage"):
@@ -315,7 +313,7 @@ def test_an_invalid_supply_is_refused_and_the_old_one_stays(supply: float) -> No
     assert (clamp_to_supply.u_clamp_min, clamp_to_supply.u_clamp_max) == (-12.0, 12.0)
 
 
-def test_a_change_is_judged_where_it_is_one_of_the_loop() -> None:
+def test_a_change_is_judged_where_it_is_one_of_the_loop():
     bad = replace(SETTINGS, loop=LoopSettings(gains=replace(GAINS, i=-1.0)))
     with pytest.raises(ValueError, match="i is -1"):
         WheelController(SETTINGS).check(bad)
@@ -325,7 +323,7 @@ def test_a_change_is_judged_where_it_is_one_of_the_loop() -> None:
         given.check(replace(bad, loop=LoopSettings(gains=replace(GAINS, i=-2.0))))
 
 
-def test_the_speed_expected_at_a_voltage_follows_from_the_feed_forward() -> None:
+def test_the_speed_expected_at_a_voltage_follows_from_the_feed_forward():
     # (12 - 0.5)/2 = 5.75 rad/s; the tolerated error is 2.875 + 0.3.
     gains = replace(GAINS, p=9.0, feedforward_velocity=2.0, feedforward_static=0.5)
     follow = replace(NO_FAULTS, tracking_time=0.75)
@@ -340,7 +338,7 @@ def test_the_speed_expected_at_a_voltage_follows_from_the_feed_forward() -> None
             assert feed.wheel.recovery.fault is fault
 
 
-def test_new_parameters_clear_a_computation_fault_and_no_other() -> None:
+def test_new_parameters_clear_a_computation_fault_and_no_other():
     for fault in Fault:
         feed = Feed()
         feed.wheel.recovery.set(fault, feed.now)
@@ -349,7 +347,7 @@ def test_new_parameters_clear_a_computation_fault_and_no_other() -> None:
     assert WheelController(replace(SETTINGS, fault_retry=7.0)).recovery.first_pause == 7.0
 
 
-def test_hardware_that_does_not_suit_the_clamps_changes_nothing() -> None:
+def test_hardware_that_does_not_suit_the_clamps_changes_nothing():
     gains = replace(GAINS, u_clamp_min=6.0, u_clamp_max=8.0)
     wheel = WheelController(replace(SETTINGS, loop=LoopSettings(gains=gains)))
     with pytest.raises(ValueError, match="clamp"):
@@ -358,7 +356,7 @@ def test_hardware_that_does_not_suit_the_clamps_changes_nothing() -> None:
     assert WheelController(SETTINGS).advice == "" and WheelController(SETTINGS).output == 0.0
 
 
-def test_advice_is_given_once_the_rate_is_known_and_taken_back_with_new_gains() -> None:
+def test_advice_is_given_once_the_rate_is_known_and_taken_back_with_new_gains():
     # At 1/64 s, one sample late and averaged over one, a first-order motor takes no such p.
     model = MotorModel(dc_gain=1.0, time_constant=0.05)
     rough = replace(SETTINGS, loop=LoopSettings(gains=replace(GAINS, p=50.0), model=model))
@@ -373,9 +371,7 @@ def test_advice_is_given_once_the_rate_is_known_and_taken_back_with_new_gains() 
     assert feed.wheel.advice == ""
 
 
-def test_a_fault_of_the_arithmetic_is_counted_held_and_silent_where_the_wheel_is_not_active() -> (
-    None
-):
+def test_a_fault_of_the_arithmetic_is_counted_held_and_silent_where_the_wheel_is_not_active():
     for active in (True, False):
         feed = Feed(active=active)
         feed.wheel.loop.speed = lambda *_: 1 // 0

@@ -45,7 +45,7 @@ def rest(loop: WheelLoop, samples: int, voltage: float = 0.0) -> list[str]:
     return sources
 
 
-def test_a_speed_source_needs_its_signals() -> None:
+def test_a_speed_source_needs_its_signals():
     assert LoopSettings().difference_window == 4
     for bad in ({"speed_source": "guess"}, {"difference_window": 0}, {"speed_source": "observer"}):
         with pytest.raises(ParameterError, match=next(iter(bad))):
@@ -53,20 +53,20 @@ def test_a_speed_source_needs_its_signals() -> None:
     LoopSettings(speed_source="observer", model=MODEL, difference_window=1)
 
 
-def test_nothing_is_asked_and_nothing_differenced_before_the_first_sample() -> None:
+def test_nothing_is_asked_and_nothing_differenced_before_the_first_sample():
     loop = make("observer")
     assert (loop.source, loop.reference) == ("measured", (0.0, 0.0, 0.0))
     unknown = WheelLoop(loop.settings)
     assert unknown.speed(DT, 1.25, 7, 3.0) == 1.25 and unknown.source == "measured"
 
 
-def test_the_speed_that_is_reported_is_passed_on_whatever_the_counts_say() -> None:
+def test_the_speed_that_is_reported_is_passed_on_whatever_the_counts_say():
     loop = make("measured")
     assert [loop.speed(DT, 1.25, count, 3.0) for count in (0, 500, 7)] == [1.25] * 3
     assert loop.source == "measured"
 
 
-def test_counts_are_differenced_over_the_window_in_the_time_that_passed() -> None:
+def test_counts_are_differenced_over_the_window_in_the_time_that_passed():
     loop = make("difference")
     assert math.isnan(loop.speed(DT, 9.0, 1000, 0.0)) and loop.source == "difference"
     assert loop.speed(DT, 9.0, 1001, 0.0) == pytest.approx(A_COUNT / DT)
@@ -77,7 +77,7 @@ def test_counts_are_differenced_over_the_window_in_the_time_that_passed() -> Non
     assert rest(make("difference"), 2 * LEARNT) == ["difference"] * 2 * LEARNT
 
 
-def test_the_observer_takes_over_once_it_knows_the_usual_interval(monkeypatch) -> None:
+def test_the_observer_takes_over_once_it_knows_the_usual_interval(monkeypatch):
     calls: list[tuple[object, ...]] = []
     real = loops.SpeedObserver
     monkeypatch.setattr(loops, "SpeedObserver", lambda *given: calls.append(given) or real(*given))
@@ -92,7 +92,7 @@ def test_the_observer_takes_over_once_it_knows_the_usual_interval(monkeypatch) -
     assert loop.speed(DT, 9.0, 500, 0.0) == 0.0 and loop.source == "observer"
 
 
-def test_an_observer_that_the_counts_contradict_gives_way_to_them() -> None:
+def test_an_observer_that_the_counts_contradict_gives_way_to_them():
     loop = make("observer")
     sources = rest(loop, LEARNT + 64, voltage=12.0)  # blocked: more load than 1 V
     assert sources[-1] == "difference (observer not trusted)"
@@ -114,7 +114,7 @@ def test_an_observer_that_the_counts_contradict_gives_way_to_them() -> None:
         ({"speed_source": "measured"}, "measured"),
     ],
 )
-def test_the_speed_source_restarts_when_its_settings_change(change, anew) -> None:
+def test_the_speed_source_restarts_when_its_settings_change(change, anew):
     loop = make("observer")
     rest(loop, LEARNT + 1)
     loop.configure(replace(loop.settings, **change))
@@ -123,7 +123,7 @@ def test_the_speed_source_restarts_when_its_settings_change(change, anew) -> Non
         assert rest(loop, LEARNT)[-2:] == ["difference", "observer"]
 
 
-def test_new_limits_of_the_reference_hold_from_the_next_set_point() -> None:
+def test_new_limits_of_the_reference_hold_from_the_next_set_point():
     slow, quick = (LoopSettings(limits=ProfileLimits(acceleration=a)) for a in (1.0, 4.0))
     changed, made = WheelLoop(slow), WheelLoop(quick)
     changed.configure(quick)
@@ -135,7 +135,7 @@ def test_new_limits_of_the_reference_hold_from_the_next_set_point() -> None:
     assert changed.reference == made.reference and made.reference.velocity == pytest.approx(1.0)
 
 
-def test_a_delayed_reference_is_the_one_of_that_long_ago() -> None:
+def test_a_delayed_reference_is_the_one_of_that_long_ago():
     seen = []
     for samples in (2, 6):
         limits = ProfileLimits(acceleration=1.0)
@@ -151,7 +151,7 @@ def test_a_delayed_reference_is_the_one_of_that_long_ago() -> None:
 
 
 @pytest.mark.parametrize(("target", "rest"), [(1.7323209436980074, 52), (1.931078245306091, 54)])
-def test_friction_is_fed_forward_up_to_the_end_of_a_change(target: float, rest: int) -> None:
+def test_friction_is_fed_forward_up_to_the_end_of_a_change(target, rest):
     """Its rate ends in a rounding error, here below zero: no turn back."""
     gains = PidGains(
         p=0.0, feedforward_static=0.5, feedforward_acceleration=1e-6, u_clamp_min=-9.0,
@@ -165,7 +165,7 @@ def test_friction_is_fed_forward_up_to_the_end_of_a_change(target: float, rest: 
     assert volts[rest + 2 :] == pytest.approx([0.5] * 18, abs=1e-4)
 
 
-def test_switching_the_delay_on_begins_its_past_at_the_present_reference() -> None:
+def test_switching_the_delay_on_begins_its_past_at_the_present_reference():
     for before, after in ((0.0, 8 * DT), (8 * DT, 0.0), (8 * DT, 4 * DT)):
         limits = ProfileLimits(acceleration=1.0)
         loop = WheelLoop(LoopSettings(limits=limits, reference_delay=before))
@@ -213,7 +213,7 @@ def clipped(clip: float, samples: int = 1500) -> tuple[list[float], list[float],
 
 
 @pytest.mark.parametrize("clip", [48.0, 21.0, 19.2])  # 18.96 V are 0.7 rad/s
-def test_a_wheel_whose_observer_is_contradicted_stays_calm_and_reaches_its_speed(clip) -> None:
+def test_a_wheel_whose_observer_is_contradicted_stays_calm_and_reaches_its_speed(clip):
     speeds, voltages, sources = clipped(clip)
     assert ("difference (observer not trusted)" in sources) == (clip < 48.0)
     assert speeds[-500:] == pytest.approx([0.7] * 500, rel=0.02)

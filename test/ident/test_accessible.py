@@ -107,9 +107,7 @@ def violations(browser: Browser) -> list[str]:
 
 @pytest.mark.skipif(AXE is None, reason="axe-core-python is not installed")
 @pytest.mark.parametrize("made", [report, fleet_page, commissioning_page])
-def test_no_page_has_a_serious_violation_wide_or_narrow_light_or_dark(
-    made: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_no_page_has_a_serious_violation_wide_or_narrow_light_or_dark(made, tmp_path, monkeypatch):
     file = tmp_path / "page.html"
     file.write_text(made(monkeypatch))
     with Browser(tmp_path / "profile") as browser:
@@ -124,9 +122,7 @@ def test_no_page_has_a_serious_violation_wide_or_narrow_light_or_dark(
         assert browser.complaints == []
 
 
-def test_charts_work_with_mouse_and_keyboard(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_charts_work_with_mouse_and_keyboard(tmp_path, monkeypatch):
     file = tmp_path / "page.html"
     file.write_text(commissioning_page(monkeypatch))
 

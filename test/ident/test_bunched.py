@@ -22,7 +22,7 @@ def bunched(size: int) -> Record:
     return replace(made, time=made.time[last] + 1e-9 * (row % size))
 
 
-def test_equal_stamps_on_a_beat_are_repaired_with_a_finding() -> None:
+def test_equal_stamps_on_a_beat_are_repaired_with_a_finding():
     plain = estimate(motors.record("rear_left", current=False, seconds=8.0))
     found = estimate(bunched(4))
     assert "arrival_beat" in [f.code for f in found.findings]
@@ -31,13 +31,13 @@ def test_equal_stamps_on_a_beat_are_repaired_with_a_finding() -> None:
     assert found.value("time_constant") == pytest.approx(plain.value("time_constant"), rel=0.02)
 
 
-def test_equal_stamps_without_a_beat_are_merged_with_a_finding() -> None:
+def test_equal_stamps_without_a_beat_are_merged_with_a_finding():
     merged = merge_bunches(bunched(4))
     assert len(merged) == pytest.approx(len(bunched(4)) / 4, abs=1)
     assert [f.severity for f in merged.findings if f.code == "stamps_equal"] == ["warning"]
 
 
-def test_segments_begin_where_they_began() -> None:
+def test_segments_begin_where_they_began():
     made = bunched(4)
     made = replace(made, starts=(0, 401, 1203))
     merged = merge_bunches(made)
@@ -47,6 +47,6 @@ def test_segments_begin_where_they_began() -> None:
     )
 
 
-def test_stamps_that_tell_samples_apart_are_left_alone() -> None:
+def test_stamps_that_tell_samples_apart_are_left_alone():
     made = motors.record("rear_left", current=False, seconds=5.0)
     assert merge_bunches(made) is made

@@ -32,7 +32,7 @@ def recorded(latest: float, seed: int) -> Record:
     return Record("rear_left", t[rows] - t[rows[0]], asked, velocity=speed)
 
 
-def test_the_scatter_of_commands_is_covered() -> None:
+def test_the_scatter_of_commands_is_covered():
     for found in (estimate(recorded(1.0, seed)) for seed in range(3)):
         true = motors.truth("rear_left", 0.0)
         for name in ("dc_gain", "time_constant", "time_constant_product"):
@@ -41,7 +41,7 @@ def test_the_scatter_of_commands_is_covered() -> None:
             assert abs(quantity.value - true[name]) < 3.5 * quantity.total_std, name
 
 
-def test_a_delay_that_is_declared_stays_so_under_scatter() -> None:
+def test_a_delay_that_is_declared_stays_so_under_scatter():
     found = estimate(recorded(1.0, 0), fixed={"delay": 0.5 / RATE})
     assert found.combinations["delay"].value == 0.5 / RATE
     lag = found.combinations["time_constant"]

@@ -72,9 +72,7 @@ def shown(browser: Browser, where: str) -> list[str]:
     return found
 
 
-def test_page_opens_with_motors_and_gains_then_yaml_then_the_drive(
-    passed: Path, tmp_path: Path
-) -> None:
+def test_page_opens_with_motors_and_gains_then_yaml_then_the_drive(passed, tmp_path):
     with Browser(tmp_path / "profile") as browser:
         browser.open(passed / "report.html", 1280)
         assert shown(browser, "main h2") == [
@@ -102,9 +100,7 @@ def test_page_opens_with_motors_and_gains_then_yaml_then_the_drive(
 
 
 @pytest.mark.parametrize("width", [1280, 390])
-def test_no_table_is_cut_and_the_page_does_not_scroll_sideways(
-    passed: Path, tmp_path: Path, width: int
-) -> None:
+def test_no_table_is_cut_and_the_page_does_not_scroll_sideways(passed, tmp_path, width):
     with Browser(tmp_path / "profile") as browser:
         browser.open(passed / "report.html", width)
         assert browser.value("document.documentElement.scrollWidth") <= width
@@ -117,7 +113,7 @@ def test_no_table_is_cut_and_the_page_does_not_scroll_sideways(
         assert ends and all(cell <= panel and over <= 0 for cell, panel, over in ends)
 
 
-def test_gains_that_have_not_driven_are_not_called_passed(passed: Path, tmp_path: Path) -> None:
+def test_gains_that_have_not_driven_are_not_called_passed(passed, tmp_path):
     made = Protocol(passed)
     made.changes([])
     made.end(False, "stopped: a wheel settles late")

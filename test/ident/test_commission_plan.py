@@ -25,9 +25,7 @@ from smp_motor_ident.report.document import identification_document
 from smp_motor_ident.result import Estimate, to_json
 
 
-def test_a_dry_run_prints_and_draws_the_plan_and_touches_nothing(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_dry_run_prints_and_draws_the_plan_and_touches_nothing(tmp_path, capsys):
     folder = tmp_path / "robot"
     arguments = ["--output", str(folder), "--amplitude", "8", "--duration", "10", "--dry-run"]
     assert main(arguments) == 0
@@ -153,7 +151,7 @@ def robot(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Steps:
     return Steps(tmp_path / "robot", monkeypatch)
 
 
-def test_an_interrupted_commissioning_sends_the_same_commands(robot: Steps) -> None:
+def test_an_interrupted_commissioning_sends_the_same_commands(robot):
     given = ["--output", str(robot.folder), "--yes"]
     robot.more = plan.Recording("excitation", "further", steps.Excitation("fourier", 9.0, 5.0))
     assert main([*given, "--amplitude", "5", "--duration", "2"]) == 0
@@ -172,9 +170,7 @@ def test_an_interrupted_commissioning_sends_the_same_commands(robot: Steps) -> N
     assert len(robot.sent) == 2 * len(sent)
 
 
-def test_interrupted_motion_is_repeated_and_completed_motion_is_not(
-    tmp_path: Path, robot: Steps
-) -> None:
+def test_interrupted_motion_is_repeated_and_completed_motion_is_not(tmp_path, robot):
     given = ["--output", str(robot.folder), "--yes"]
     other = tmp_path / "other"
     other.mkdir()
@@ -195,7 +191,7 @@ def test_interrupted_motion_is_repeated_and_completed_motion_is_not(
     assert document["passed"] and document["checks"]["left"]["gain"] == 25.0
 
 
-def test_a_drive_that_failed_is_driven_again_and_nothing_else_is_done_again(robot: Steps) -> None:
+def test_a_drive_that_failed_is_driven_again_and_nothing_else_is_done_again(robot):
     given = ["--output", str(robot.folder), "--yes"]
     robot.cut = "verify"
     assert main(given) == 130
@@ -210,7 +206,7 @@ def test_a_drive_that_failed_is_driven_again_and_nothing_else_is_done_again(robo
     assert robot.done == ["excite", "identify", "validate", "tune", "verify"]
 
 
-def test_a_drive_alone_is_asked_for_too(robot: Steps, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_drive_alone_is_asked_for_too(robot, capsys):
     given = ["--output", str(robot.folder)]
     robot.cut = "verify"
     assert main([*given, "--yes"]) == 130
@@ -220,8 +216,8 @@ def test_a_drive_alone_is_asked_for_too(robot: Steps, capsys: pytest.CaptureFixt
 
 
 def test_gains_that_no_controller_could_keep_are_refused_before_anything_moves(
-    robot: Steps, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+    robot, capsys, monkeypatch
+):
     monkeypatch.setattr(Client, "controlled", False)
     given = ["--output", str(robot.folder), "--yes"]
     assert main([*given, "--apply"]) == 2
@@ -233,9 +229,7 @@ def test_gains_that_no_controller_could_keep_are_refused_before_anything_moves(
     assert told.index("one is started") < told.index("exciting: sine")
 
 
-def test_an_unreliable_motor_is_designed_on_only_where_that_is_accepted(
-    robot: Steps, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_unreliable_motor_is_designed_on_only_where_that_is_accepted(robot, monkeypatch):
     grave = Finding("lag", "unreliable", "the gain may be off", {}, "record longer")
     robot.estimate = replace(robot.estimate, findings=(grave,))
     tuned = list[str]()
@@ -251,9 +245,7 @@ def test_an_unreliable_motor_is_designed_on_only_where_that_is_accepted(
     assert "Passed with accepted findings." in (robot.folder / "report.html").read_text()
 
 
-def test_a_wrong_wire_stops_before_the_excitation_unless_it_is_accepted(
-    robot: Steps, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_wrong_wire_stops_before_the_excitation_unless_it_is_accepted(robot, capsys):
     robot.found = (STOP,)
     given = ["--output", str(robot.folder), "--yes"]
     assert main(given) == 1
@@ -268,9 +260,7 @@ def test_a_wrong_wire_stops_before_the_excitation_unless_it_is_accepted(
     assert "Passed with accepted findings." in page
 
 
-def test_a_hot_winding_ends_it_before_the_next_signal_and_goes_on_when_it_is_cool(
-    robot: Steps,
-) -> None:
+def test_a_hot_winding_ends_it_before_the_next_signal_and_goes_on_when_it_is_cool(robot):
     given = ["--output", str(robot.folder), "--yes"]
     robot.heat = [Finding("winding_hot", "refused", "left: 60 K hotter", {"wheel": "left"}, "wait")]
     assert main(given) != 0
@@ -281,9 +271,7 @@ def test_a_hot_winding_ends_it_before_the_next_signal_and_goes_on_when_it_is_coo
     assert robot.done.count("excite") == 4
 
 
-def test_the_reason_of_an_abnormal_end_is_on_the_page(
-    robot: Steps, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_reason_of_an_abnormal_end_is_on_the_page(robot, monkeypatch):
     def refuse(*_: object) -> None:
         raise ProcessError("left/wheel_pid refused the parameters")
 
@@ -293,9 +281,7 @@ def test_the_reason_of_an_abnormal_end_is_on_the_page(
     assert document["passed"] is False and "refused the parameters" in document["verdict"]
 
 
-def test_a_wheel_that_turns_faster_than_its_checks_or_its_limit_ends_the_excitation(
-    robot: Steps,
-) -> None:
+def test_a_wheel_that_turns_faster_than_its_checks_or_its_limit_ends_the_excitation(robot):
     given = ["--output", str(robot.folder), "--yes"]
     assert main(given) == 0
     # The checks show 1.6 rad/s; half as much again is no supply's and no friction's doing.
@@ -308,7 +294,7 @@ def test_a_wheel_that_turns_faster_than_its_checks_or_its_limit_ends_the_excitat
     assert asked == [3.0, 2.0]
 
 
-def test_the_remaining_time_follows_the_duration_of_similar_parts() -> None:
+def test_the_remaining_time_follows_the_duration_of_similar_parts():
     now = [0.0]
     robots = [plan.Recording("excitation", name, steps.Excitation(name, 10.0, 6.0))
               for name in ("sine", "square")]  # fmt: skip
@@ -329,7 +315,7 @@ def test_the_remaining_time_follows_the_duration_of_similar_parts() -> None:
     assert plan.format_duration(30.4) == "30 s" and plan.format_duration(123.0) == "2 min 5 s"
 
 
-def test_a_motor_that_is_not_known_well_enough_is_recorded_once_more() -> None:
+def test_a_motor_that_is_not_known_well_enough_is_recorded_once_more():
     known = make_estimate()  # to a percent, and the gain better
     assert plan.plan_further({"left": known}, 6.0) is None
     vague = replace(known.combinations["time_constant"], std=0.002)  # 5 %

@@ -124,9 +124,7 @@ def numbers(folder: Path) -> dict[str, Any]:
     }
 
 
-def test_it_ends_with_the_same_numbers_to_the_bit(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_it_ends_with_the_same_numbers_to_the_bit(tmp_path, monkeypatch):
     robot, codes = Robot(monkeypatch), list[int]()
     asked = ["--yes", "--amplitude", "6", "--duration", "2"]
     assert main(["--output", str(tmp_path / "whole"), *asked]) == 0

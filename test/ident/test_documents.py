@@ -22,7 +22,7 @@ from smp_motor_ident.report.document import (
 )
 
 
-def test_document_reads_back_as_the_same_estimates(tmp_path: Path) -> None:
+def test_document_reads_back_as_the_same_estimates(tmp_path):
     wheels = {"front_left": estimate(), "rear_left": estimate("rear_left", current=False)}
     path = tmp_path / "identification.json"
     path.write_text(json.dumps(identification_document(wheels), allow_nan=False))
@@ -30,7 +30,7 @@ def test_document_reads_back_as_the_same_estimates(tmp_path: Path) -> None:
     assert identification_document(again) == identification_document(wheels)
 
 
-def test_motors_file_has_parameters_where_known_and_combinations_where_not() -> None:
+def test_motors_file_has_parameters_where_known_and_combinations_where_not():
     wheels = {"front_left": estimate(), "rear_left": estimate("rear_left", current=False)}
     text = motors_yaml(wheels, ["from a bag"])
     motors = yaml.safe_load(text)["/**/motor_plant"]["ros__parameters"]["motors"]
@@ -46,9 +46,7 @@ def test_motors_file_has_parameters_where_known_and_combinations_where_not() -> 
     ("text", "reason"),
     [("{", "is not JSON"), ("[]", "schema"), ('{"schema": 1, "motors": {"a": {}}}', "damaged")],
 )
-def test_a_damaged_document_is_named_with_its_reason(
-    tmp_path: Path, text: str, reason: str
-) -> None:
+def test_a_damaged_document_is_named_with_its_reason(tmp_path, text, reason):
     path = tmp_path / "identification.json"
     path.write_text(text)
     with pytest.raises(BagError, match=reason) as error:
@@ -58,7 +56,7 @@ def test_a_damaged_document_is_named_with_its_reason(
 
 
 @pytest.mark.parametrize("junk", [None, True, -1, 1e308, 10**400, "x", [], {}, [[]], {"a": {}}])
-def test_any_document_is_read_or_refused_in_one_line(tmp_path: Path, junk: object) -> None:
+def test_any_document_is_read_or_refused_in_one_line(tmp_path, junk):
     whole = json.dumps(identification_document({"w": estimate()}))
 
     def places(node: object, way: tuple[str | int, ...] = ()) -> Iterator[tuple[str | int, ...]]:
@@ -85,14 +83,14 @@ def test_any_document_is_read_or_refused_in_one_line(tmp_path: Path, junk: objec
 
 
 @pytest.mark.parametrize("name", ['a*/\nsystem("x"); //', "a b", "1a", "", "a/", "ä", "../a"])
-def test_a_wheel_that_has_no_ros_name_is_refused(tmp_path: Path, name: str) -> None:
+def test_a_wheel_that_has_no_ros_name_is_refused(tmp_path, name):
     path = tmp_path / "identification.json"
     path.write_text(json.dumps(identification_document({name: estimate()})))
     with pytest.raises(BagError, match="has no ROS name"):
         read_identification(path)
 
 
-def test_texts_of_a_document_stay_in_their_lines(tmp_path: Path) -> None:
+def test_texts_of_a_document_stay_in_their_lines(tmp_path):
     document = identification_document({"w": estimate()})
     document["motors"]["w"]["sources"] = ["bag\n#define K_P 0\x1b[2J"]
     (tmp_path / "identification.json").write_text(json.dumps(document))
@@ -100,7 +98,7 @@ def test_texts_of_a_document_stay_in_their_lines(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["frequency", "shown", "bound"])
-def test_lists_of_unequal_length_are_refused(tmp_path: Path, name: str) -> None:
+def test_lists_of_unequal_length_are_refused(tmp_path, name):
     error = {"frequency": [1.0, 2.0], "shown": [0.1, 0.1], "bound": [0.2, 0.2]}
     document = identification_document({"w": estimate()})
     document["motors"]["w"]["residuals"]["model_error"] = {**error, name: [1.0]}
@@ -109,7 +107,7 @@ def test_lists_of_unequal_length_are_refused(tmp_path: Path, name: str) -> None:
         read_identification(tmp_path)
 
 
-def test_pipes_and_devices_are_refused_at_once(tmp_path: Path) -> None:
+def test_pipes_and_devices_are_refused_at_once(tmp_path):
     os.mkfifo(tmp_path / "identification.json")
     with pytest.raises(BagError, match="is not a file"):
         read_identification(tmp_path)
@@ -117,7 +115,7 @@ def test_pipes_and_devices_are_refused_at_once(tmp_path: Path) -> None:
         read_parameters(tmp_path / "identification.json")
 
 
-def test_aliases_count_whole_before_a_parameter_file_is_built(tmp_path: Path) -> None:
+def test_aliases_count_whole_before_a_parameter_file_is_built(tmp_path):
     inner = (",".join([f"*a{k - 1}" if k else "1"] * 10) for k in range(9))
     text = "".join(f"a{k}: &a{k} [{one}]\n" for k, one in enumerate(inner))
     (tmp_path / "a.yaml").write_text(text)
@@ -126,7 +124,7 @@ def test_aliases_count_whole_before_a_parameter_file_is_built(tmp_path: Path) ->
 
 
 @pytest.mark.parametrize("text", ["[" * 100_000, '{"schema": 1, "motors": ' + '{"a":' * 100_000])
-def test_a_document_nested_without_end_is_refused(tmp_path: Path, text: str) -> None:
+def test_a_document_nested_without_end_is_refused(tmp_path, text):
     (tmp_path / "identification.json").write_text(text)
     with pytest.raises(BagError, match="is not JSON"):
         read_identification(tmp_path)
@@ -147,9 +145,7 @@ def test_a_document_nested_without_end_is_refused(tmp_path: Path, text: str) -> 
         ("\xff", "is not YAML"),
     ],
 )  # fmt: skip
-def test_an_invalid_parameter_file_is_refused_in_one_line(
-    tmp_path: Path, text: str, reason: str
-) -> None:
+def test_an_invalid_parameter_file_is_refused_in_one_line(tmp_path, text, reason):
     path = tmp_path / "gains.yaml"
     path.write_bytes(text.encode("latin-1"))
     with pytest.raises(ParameterError, match=reason) as error:
@@ -158,7 +154,7 @@ def test_an_invalid_parameter_file_is_refused_in_one_line(
     assert "\n" not in str(error.value)
 
 
-def test_files_appear_together_and_nothing_is_overwritten_without_force(tmp_path: Path) -> None:
+def test_files_appear_together_and_nothing_is_overwritten_without_force(tmp_path):
     folder = tmp_path / "a" / "b"
     files: dict[Path, str | bytes] = {folder / "x.json": "1", folder / "y.yaml": b"2"}
     write_together(files)
@@ -171,9 +167,7 @@ def test_files_appear_together_and_nothing_is_overwritten_without_force(tmp_path
     assert (folder / "y.yaml").read_text() == "4"
 
 
-def test_a_failed_write_restores_the_old_files(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_failed_write_restores_the_old_files(tmp_path, monkeypatch):
     write_together({tmp_path / "a": "old a", tmp_path / "c": "old c"})
     rename = os.replace
 
@@ -190,7 +184,7 @@ def test_a_failed_write_restores_the_old_files(
     assert kept == {"a": "old a", "c": "old c"}
 
 
-def test_a_folder_that_cannot_be_made_is_named(tmp_path: Path) -> None:
+def test_a_folder_that_cannot_be_made_is_named(tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(ParameterError, match="cannot be written"):
         write_together({tmp_path / "file" / "sub" / "x": "1"})

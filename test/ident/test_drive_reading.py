@@ -6,7 +6,6 @@ from __future__ import annotations
 import json
 import math
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -28,7 +27,7 @@ def table(time: np.ndarray, **columns: np.ndarray) -> Table:
     return Table(None, np.round(1e9 * time).astype(np.int64), columns)
 
 
-def test_a_drive_settles_as_tune_predicts(tmp_path: Path) -> None:
+def test_a_drive_settles_as_tune_predicts(tmp_path):
     motors = find_paper_motors()
     gains = tmp_path / "gains.yaml"
     assert tune.main([str(motors), "--output", str(gains), "--supply", "12"]) == 0

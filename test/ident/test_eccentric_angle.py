@@ -11,7 +11,7 @@ from smp_motor_ident.record import Hardware, Record
 
 
 @pytest.mark.parametrize("error", [0.0, 0.003, 0.06])
-def test_encoder_error_once_a_turn_is_found_with_its_size(error: float) -> None:
+def test_encoder_error_once_a_turn_is_found_with_its_size(error):
     rng = np.random.default_rng(1)
     t = np.arange(4000) / 200
     voltage = np.repeat(rng.uniform(-9.0, 9.0, 100), 40)

@@ -234,7 +234,7 @@ def test_a_square_wave_without_current_does_not_lead_friction_astray(seed):
     check(result, truth, ("dc_gain", "time_constant", "static_voltage"))
 
 
-def test_a_load_stronger_than_friction_is_accepted() -> None:
+def test_a_load_stronger_than_friction_is_accepted():
     R, L, K, J, B, TC, load = 0.56, 7.7e-5, 0.044, 7.15e-5, 7.6e-4, 0.033, 0.04
     t = np.arange(1558) / 500.0
     up = np.linspace(0.0, 3.0, 7)

@@ -41,20 +41,20 @@ def drawn() -> list[tuple[str, str]]:
     return [(name, row[2]) for row in rows if row for name in row[1].strip().split(", ")]
 
 
-def test_every_function_of_the_drawings_is_in_its_file() -> None:
+def test_every_function_of_the_drawings_is_in_its_file():
     assert len(drawn()) > 50
     for name, file in drawn():
         assert name in names_in(file), f"{file} has no {name}"
 
 
-def test_types_of_the_page_are_in_their_files() -> None:
+def test_types_of_the_page_are_in_their_files():
     rows = re.findall(r"^\| `(\w+)` \| `([\w/]+\.py)` \|", page("record.md"), re.MULTILINE)
     assert len(rows) == 10
     for name, file in rows:
         assert name in names_in(file), f"{file} has no {name}"
 
 
-def test_functions_are_drawn_in_the_order_in_which_they_are_called() -> None:
+def test_functions_are_drawn_in_the_order_in_which_they_are_called():
     text = (ROOT / "smp_motor_ident/estimate.py").read_text(encoding="utf-8")
     body = text[text.index("    group = [records]") :]
     calls = ["checked(", "repaired(", "screen(", "excitation(", "prepare(", "_best_fit(",
@@ -66,7 +66,7 @@ def test_functions_are_drawn_in_the_order_in_which_they_are_called() -> None:
     assert [order.index(n) for n in names] == sorted(order.index(n) for n in names)
 
 
-def test_table_of_effects_is_the_catalogue() -> None:
+def test_table_of_effects_is_the_catalogue():
     rows = page("identification.md").split("## Effects that are found")[1].splitlines()
     cells = [line.split("|") for line in rows if line.startswith("| `")]
     codes = [code for row in cells for code in re.findall(r"`(\w+)`", row[1])]
@@ -75,9 +75,7 @@ def test_table_of_effects_is_the_catalogue() -> None:
     assert set(sizes) <= set(UNITS)
 
 
-def test_program_of_the_page_prints_what_the_page_shows(
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_program_of_the_page_prints_what_the_page_shows(capsys):
     text = page("identification.md")
     (program,) = fences(text, "python")
     shown = fences(text, "text")[1].splitlines()

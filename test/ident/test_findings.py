@@ -26,7 +26,7 @@ ROOT = Path(__file__).resolve().parents[2]
 TABLES = (limits, samples, recordings, gains, wheels)
 
 
-def test_the_page_of_limits_matches_the_tables() -> None:
+def test_the_page_of_limits_matches_the_tables():
     made = subprocess.run(
         [sys.executable, ROOT / "scripts" / "limits.py"], capture_output=True, text=True, check=True
     )
@@ -34,7 +34,7 @@ def test_the_page_of_limits_matches_the_tables() -> None:
     assert page == made.stdout, "python scripts/limits.py > docs/limits.md"
 
 
-def test_every_limit_names_a_test_that_exists() -> None:
+def test_every_limit_names_a_test_that_exists():
     files = {path.name: path.read_text() for path in (ROOT / "test").rglob("test_*.py")}
     for limit in (one for table in TABLES for one in vars(table).values()):
         if isinstance(limit, limits.Limit):
@@ -45,12 +45,12 @@ def test_every_limit_names_a_test_that_exists() -> None:
                 assert f"def test_{words.replace(' ', '_')}" in files[name], named
 
 
-def test_clean_data_have_no_finding_beyond_a_note() -> None:
+def test_clean_data_have_no_finding_beyond_a_note():
     result = estimate(motors.record("rear_left", seconds=8.0))
     assert [f for f in result.findings if f.severity != "note"] == []
 
 
-def test_the_curves_agree_with_the_verdict() -> None:
+def test_the_curves_agree_with_the_verdict():
     result = estimate(motors.record("rear_left", seconds=8.0))
     curve = result.residuals.autocorrelation
     assert curve is not None
@@ -59,7 +59,7 @@ def test_the_curves_agree_with_the_verdict() -> None:
     assert curve.value[0] == pytest.approx(1.0, abs=1e-12)  # by definition, but for rounding
 
 
-def test_findings_of_the_reader_are_kept() -> None:
+def test_findings_of_the_reader_are_kept():
     read = Finding("samples_missing", "warning", "what the reader found")
     result = estimate(replace(motors.record("rear_left"), findings=(read,)))
     assert read.message in result.warnings
@@ -67,7 +67,7 @@ def test_findings_of_the_reader_are_kept() -> None:
 
 
 @pytest.mark.parametrize("share", [0.0, 0.1, 1.0])
-def test_a_speed_that_is_filtered_may_be_the_sensors_lag(share: float) -> None:
+def test_a_speed_that_is_filtered_may_be_the_sensors_lag(share):
     """One lag and a part of it more, under a random voltage of two sizes, solved exactly."""
     rate, lag, rng = 500.0, 0.05, np.random.default_rng(5)
     voltage = np.repeat(rng.choice([-8.0, -4.0, 4.0, 8.0], 60), 40)
@@ -84,14 +84,14 @@ def test_a_speed_that_is_filtered_may_be_the_sensors_lag(share: float) -> None:
         assert abs(motor.value - 1.02 * lag) < 2.5 * motor.total_std
 
 
-def test_a_motor_that_rings_has_a_winding_and_no_filter() -> None:
+def test_a_motor_that_rings_has_a_winding_and_no_filter():
     # Motor 1 of Table 1: L/R of 24 ms, R J / (K^2 + R b) of 34 ms, damping 0.90.
     found = estimate(replace(motors.record("front_left", seconds=8.0), current=None)).findings
     assert not [f for f in found if f.code == "low_passed_speed"]
 
 
 @pytest.mark.parametrize(("scale", "severity"), [(1.0, "note"), (1.3, "unreliable")])
-def test_a_current_whose_scale_an_ohmmeter_shows(scale: float, severity: str) -> None:
+def test_a_current_whose_scale_an_ohmmeter_shows(scale, severity):
     made = motors.record("rear_left", seconds=3.0)
     assert made.current is not None
     ohm = motors.truth("rear_left", 0.3)["resistance"]
@@ -109,7 +109,7 @@ def test_a_current_whose_scale_an_ohmmeter_shows(scale: float, severity: str) ->
 
 
 @pytest.mark.parametrize(("kind", "severity"), [("square", "warning"), ("fourier", "note")])
-def test_a_current_of_the_supply_looks_like_a_scale_under_one_size(kind: str, severity: str):
+def test_a_current_of_the_supply_looks_like_a_scale_under_one_size(kind, severity):
     found = estimate(motors.record("rear_left", kinds=(kind,), seconds=3.0))
     about = next(f for f in found.findings if f.code == "current_scale")
     assert about.severity == severity

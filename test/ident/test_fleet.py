@@ -36,7 +36,7 @@ def rows(slope: float, seed: int = 0, robot: str = "one", level: float = 25.0) -
     ]  # fmt: skip
 
 
-def test_a_motor_that_drifts_is_told_from_those_that_do_not() -> None:
+def test_a_motor_that_drifts_is_told_from_those_that_do_not():
     # Of a hundred motors that stay, none: 100 times 6 in 100,000.
     steady = [row for k in range(100) for row in rows(0.0, k, f"robot{k}")]
     (mark,) = drifts([*steady, *rows(-0.001, 7, "worn")])
@@ -50,13 +50,13 @@ def test_a_motor_that_drifts_is_told_from_those_that_do_not() -> None:
     assert "4.6 standard deviations over 10 recordings in 9 days" in mark.text
 
 
-def test_recordings_without_a_date_are_not_compared_over_time() -> None:
+def test_recordings_without_a_date_are_not_compared_over_time():
     undated = [replace(row, date=None) for row in rows(-0.01, 7)]
     assert drifts(undated) == []
     assert "10 without a date" in page(undated, [])
 
 
-def test_a_motor_unlike_the_others_stands_out_and_a_few_robots_are_not_compared() -> None:
+def test_a_motor_unlike_the_others_stands_out_and_a_few_robots_are_not_compared():
     rng = np.random.default_rng(3)
     same = [row for k in range(8) for row in rows(0.0, k, f"r{k}", 25 + float(rng.normal(0, 0.3)))]
     other = rows(0.0, 9, "other", 28.0)
@@ -80,8 +80,8 @@ def fake(path: str, settings: tuple[Any, ...]) -> list[Row]:
 
 
 def test_a_broken_bag_fails_alone_a_killed_worker_loses_nothing_and_no_work_is_done_twice(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+    tmp_path, monkeypatch
+):
     monkeypatch.setattr(command, "identify_one", fake)
     folder = tmp_path / "robot7"
     folder.mkdir()
@@ -102,9 +102,7 @@ def test_a_broken_bag_fails_alone_a_killed_worker_loses_nothing_and_no_work_is_d
     assert (folder / "log").read_text() == before + "fine.csv\n"
 
 
-def test_a_cluster_without_dask_is_refused_with_advice(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_cluster_without_dask_is_refused_with_advice(tmp_path, capsys):
     try:
         import distributed  # noqa: F401
     except ImportError:
@@ -133,7 +131,7 @@ MAPPED = ["--map", "time=t", "voltage=u", "velocity=w"]
 MONDAY = 1_788_767_600.0  # 2026-09-07 07:53:20 UTC
 
 
-def test_signals_are_mapped_alike_for_every_recording(tmp_path: Path) -> None:
+def test_signals_are_mapped_alike_for_every_recording(tmp_path):
     bags = [str(write_drive(tmp_path / name / "a.csv", 0.0)) for name in ("one", "two")]
     assert main([*bags, "--fleet", *MAPPED, "--output", str(tmp_path / "out"), "--quiet"]) == 0
     table = list(csv.DictReader((tmp_path / "out" / "fleet.csv").open()))
@@ -145,9 +143,7 @@ def test_signals_are_mapped_alike_for_every_recording(tmp_path: Path) -> None:
     assert [r["date"] for r in table] == ["", ""]  # stamps from 0 are no date
 
 
-def test_a_recording_has_its_own_time_and_its_numbers_are_printed_with_units(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_recording_has_its_own_time_and_its_numbers_are_printed_with_units(tmp_path, capsys):
     bags = [
         write_drive(tmp_path / robot / f"day{day}.csv", MONDAY + DAY * day)
         for robot in ("one", "two")
@@ -175,7 +171,7 @@ def test_a_recording_has_its_own_time_and_its_numbers_are_printed_with_units(
 
 
 @pytest.mark.skipif(not CHROMIUM, reason="no Chromium on this machine")
-def test_the_table_is_read_whole_on_a_screen_and_on_a_phone(tmp_path: Path) -> None:
+def test_the_table_is_read_whole_on_a_screen_and_on_a_phone(tmp_path):
     units = {"dc_gain": "rad/s/V", "time_constant": "s", "static_voltage": "V", "resistance": "ohm"}
     numbers = {
         name: Quantity(25.54832, 0.00079, (25.54678, 25.54986), unit)

@@ -20,14 +20,14 @@ def estimate(quantity: Quantity | None, **parameters: Quantity) -> Estimate:
     return Estimate("front_left", "first_order", parameters, combinations)
 
 
-def test_a_standard_deviation_alone_gives_a_normal_interval() -> None:
+def test_a_standard_deviation_alone_gives_a_normal_interval():
     found = friction_of(estimate(Quantity(1.0, 0.1)), SUPPLY)
     assert (found.low, found.high) == pytest.approx((1.0 - Z95 * 0.1, 1.0 + Z95 * 0.1), abs=1e-4)
     assert found.known == found.planned == 1.0 and found.finding is None
 
 
 @pytest.mark.parametrize(("half", "known"), [(0.239, True), (0.241, False)])
-def test_friction_is_known_to_a_fiftieth_of_the_supply(half: float, known: bool) -> None:
+def test_friction_is_known_to_a_fiftieth_of_the_supply(half, known):
     found = friction_of(estimate(Quantity(1.0, 0.1, (1.0 - half, 1.0 + half))), SUPPLY)
     assert found.known == (1.0 if known else 1.0 - half)
     assert found.planned == (1.0 if known else 1.0 + half)
@@ -37,7 +37,7 @@ def test_friction_is_known_to_a_fiftieth_of_the_supply(half: float, known: bool)
         assert found.finding.evidence == {"low": 1.0 - half, "high": 1.0 + half}
 
 
-def test_friction_is_neither_negative_nor_above_the_supply() -> None:
+def test_friction_is_neither_negative_nor_above_the_supply():
     found = friction_of(estimate(Quantity(0.1, 0.5, (-0.9, 1.1))), SUPPLY)
     assert (found.low, found.high) == (0.0, 1.1)
     found = friction_of(estimate(Quantity(10.0, 2.0, (8.0, 14.0))), SUPPLY)
@@ -47,7 +47,7 @@ def test_friction_is_neither_negative_nor_above_the_supply() -> None:
 
 
 @pytest.mark.parametrize(("width", "refused"), [(5.99, False), (6.01, True)])
-def test_half_of_the_supply_is_too_much_not_to_know(width: float, refused: bool) -> None:
+def test_half_of_the_supply_is_too_much_not_to_know(width, refused):
     given = estimate(Quantity(None, None, (0.0, width), status="unidentifiable"))
     if refused:
         with pytest.raises(DesignError, match=r"anything from 0 to 6\.01 V of the 12 V supply"):
@@ -56,7 +56,7 @@ def test_half_of_the_supply_is_too_much_not_to_know(width: float, refused: bool)
         assert friction_of(given, SUPPLY).high == width
 
 
-def test_friction_that_was_not_identified_is_left_to_the_integral() -> None:
+def test_friction_that_was_not_identified_is_left_to_the_integral():
     found = friction_of(estimate(None), SUPPLY)
     assert (found.known, found.low, found.high) == (0.0, 0.0, 0.0)
     assert found.finding is not None and found.finding.code == "friction_unknown"
@@ -65,7 +65,7 @@ def test_friction_that_was_not_identified_is_left_to_the_integral() -> None:
             friction_of(estimate(nothing), SUPPLY)
 
 
-def test_friction_as_a_torque_is_taken_through_resistance_and_motor_constant() -> None:
+def test_friction_as_a_torque_is_taken_through_resistance_and_motor_constant():
     parts = {"resistance": Quantity(12.0, 0.0), "motor_constant": Quantity(0.02, 0.0)}
     given = estimate(None, coulomb_friction=Quantity(1e-3, 1e-5), **parts)
     found = friction_of(given, SUPPLY)

@@ -8,7 +8,6 @@ import os
 import re
 import subprocess
 import sys
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from subprocess import PIPE
@@ -58,7 +57,7 @@ def complaint(capsys: pytest.CaptureFixture[str]) -> str:
     return lines[0]
 
 
-def test_it_writes_its_three_files_and_recovers_the_motor(recording: Path, tmp_path: Path) -> None:
+def test_it_writes_its_three_files_and_recovers_the_motor(recording, tmp_path):
     output = tmp_path / "result"
     assert main([str(recording), *MAP, "--output", str(output)]) == 0
     assert sorted(p.name for p in output.iterdir()) == sorted(OUTPUTS)
@@ -80,9 +79,7 @@ UNITS = {"ms": 1e-3, "ms²": 1e-6}
 
 
 @pytest.mark.skipif(not CHROMIUM, reason="no Chromium on this machine")
-def test_terminal_json_and_page_state_the_same_numbers(
-    recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_terminal_json_and_page_state_the_same_numbers(recording, tmp_path, capsys):
     output = tmp_path / "result"
     assert main([str(recording), *MAP, "--output", str(output)]) == 0
     terminal = capsys.readouterr().out
@@ -109,11 +106,8 @@ def test_terminal_json_and_page_state_the_same_numbers(
 
 
 def test_the_terminal_shows_the_three_gravest_messages_and_all_on_request(
-    recording: Path,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+    recording, tmp_path, monkeypatch, capsys
+):
     findings = [
         *(Finding(f"note_{k}", "note", f"note {k} of dc_gain") for k in range(2)),
         *(Finding(f"odd_{k}", "warning", f"warning {k}", {}, f"do {k}") for k in range(3)),
@@ -139,9 +133,7 @@ def test_the_terminal_shows_the_three_gravest_messages_and_all_on_request(
     assert "6. Note: Note 1 of DC gain." in said.out
 
 
-def test_it_replaces_nothing_without_force(
-    recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_it_replaces_nothing_without_force(recording, tmp_path, capsys):
     (tmp_path / "motors.yaml").write_text("mine")
     arguments = [str(recording), *MAP, "--output", str(tmp_path), "--quiet"]
     assert main(arguments) == 2
@@ -171,13 +163,8 @@ def test_it_replaces_nothing_without_force(
     ],
 )
 def test_wrong_usage_is_one_line_and_leaves_nothing(
-    arguments: list[str],
-    word: str,
-    recording: Path,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+    arguments, word, recording, tmp_path, monkeypatch, capsys
+):
     (tmp_path / "log.csv").write_bytes(recording.read_bytes())
     monkeypatch.chdir(tmp_path)
     assert main([*arguments, "--output", "result"]) == 2
@@ -185,25 +172,19 @@ def test_wrong_usage_is_one_line_and_leaves_nothing(
     assert not (tmp_path / "result").exists()
 
 
-def test_without_output_it_asks_for_one(
-    recording: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_without_output_it_asks_for_one(recording, capsys):
     assert main([str(recording), *MAP]) == 2
     assert "--output" in complaint(capsys)
 
 
-def test_a_motor_that_was_not_moved_is_refused_with_advice(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_motor_that_was_not_moved_is_refused_with_advice(tmp_path, capsys):
     still = write_csv(tmp_path / "still.csv", level=0.0)
     assert main([str(still), *MAP, "--output", str(tmp_path / "result")]) == 1
     assert "record" in complaint(capsys)
     assert not (tmp_path / "result").exists()
 
 
-def test_good_wheels_are_written_when_another_is_refused(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_good_wheels_are_written_when_another_is_refused(tmp_path, capsys):
     good, still = write_csv(tmp_path / "a.csv"), write_csv(tmp_path / "b.csv", level=0.0)
     both = np.hstack([np.loadtxt(p, delimiter=",", skiprows=1) for p in (good, still)])
     np.savetxt(
@@ -219,7 +200,7 @@ def test_good_wheels_are_written_when_another_is_refused(
     assert "not identified" in (output / "report.html").read_text()
 
 
-def test_another_recording_judges_the_model(recording: Path, tmp_path: Path) -> None:
+def test_another_recording_judges_the_model(recording, tmp_path):
     other = write_csv(tmp_path / "other.csv", seed=2)
     output = tmp_path / "result"
     arguments = [str(recording), *MAP, "--validate", str(other), "--output", str(output)]
@@ -230,9 +211,7 @@ def test_another_recording_judges_the_model(recording: Path, tmp_path: Path) -> 
     assert "other.csv" in (output / "report.html").read_text()
 
 
-def test_the_executable_complains_without_a_traceback(
-    process: Callable[..., object], tmp_path: Path
-) -> None:
+def test_the_executable_complains_without_a_traceback(process, tmp_path):
     (tmp_path / "not_a_bag.mcap").write_bytes(b"not a bag at all")
     tool = process("identify", "not_a_bag.mcap", "--output", "result")
     assert tool.wait(60.0) == 2  # type: ignore[attr-defined]
@@ -260,14 +239,8 @@ def found(severity: str) -> Estimate:
     ],
 )
 def test_an_unreliable_answer_is_written_and_ends_with_one_unless_accepted(
-    severity: str,
-    options: tuple[str, ...],
-    code: int,
-    recording: Path,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+    severity, options, code, recording, tmp_path, monkeypatch, capsys
+):
     monkeypatch.setattr(identification, "estimate", lambda *_, **__: found(severity))
     output = tmp_path / "result"
     assert main([str(recording), *MAP, "--output", str(output), "--quiet", *options]) == code
@@ -281,7 +254,7 @@ def test_an_unreliable_answer_is_written_and_ends_with_one_unless_accepted(
     assert "Record a slow ramp." in page
 
 
-def test_a_reader_that_has_gone_does_not_change_the_answer(recording: Path, tmp_path: Path) -> None:
+def test_a_reader_that_has_gone_does_not_change_the_answer(recording, tmp_path):
     command = [sys.executable, "-m", "smp_motor_ident.cli.identify", str(recording), *MAP]
     tool = subprocess.Popen(
         [*command, "--output", str(tmp_path / "result")], stdout=subprocess.PIPE, stderr=PIPE
@@ -295,7 +268,7 @@ def test_a_reader_that_has_gone_does_not_change_the_answer(recording: Path, tmp_
 
 
 @pytest.mark.parametrize("tool", ["identify", "commission", "demo"])
-def test_help_loads_nothing_that_computes(tool: str) -> None:
+def test_help_loads_nothing_that_computes(tool):
     # What takes the time is known; a time would depend on what else this machine does.
     program = (
         f"import sys\nfrom smp_motor_ident.cli.{tool} import main\nassert main(['--help']) == 0\n"
@@ -306,13 +279,13 @@ def test_help_loads_nothing_that_computes(tool: str) -> None:
 
 
 @pytest.mark.parametrize("node", ["record", "play"])
-def test_nodes_for_messages_load_no_numerical_modules(node: str) -> None:
+def test_nodes_for_messages_load_no_numerical_modules(node):
     slow = "assert not {'scipy', 'numba', 'matplotlib'} & set(sys.modules)"
     program = f"import sys\nimport smp_motor_ident.nodes.{node}\n{slow}\n"
     subprocess.run([sys.executable, "-c", program], check=True)
 
 
-def test_paths_that_are_not_utf_8_are_read_and_written(recording: Path, tmp_path: Path) -> None:
+def test_paths_that_are_not_utf_8_are_read_and_written(recording, tmp_path):
     name = os.fsdecode(b"log\xff\xfe")
     log, output = tmp_path / f"{name}.csv", tmp_path / name
     log.write_bytes(recording.read_bytes())
@@ -325,9 +298,7 @@ def test_paths_that_are_not_utf_8_are_read_and_written(recording: Path, tmp_path
     assert tune.main([str(output), "--supply", "12", "--output", f"{output}.yaml"]) == 0
 
 
-def test_a_place_where_nothing_can_be_written_is_told_before_the_work(
-    recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_place_where_nothing_can_be_written_is_told_before_the_work(recording, tmp_path, capsys):
     nowhere = "/proc/self/nothing"  # where not even root may write
     assert main([str(tmp_path / "no.csv"), *MAP, "--output", nowhere]) == 2
     assert "cannot be written" in capsys.readouterr().err

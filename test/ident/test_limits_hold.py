@@ -18,7 +18,7 @@ def share_of(quantity: Quantity, cause: str) -> Share | None:
 
 
 @pytest.mark.parametrize("scale", [0.96, 1.04])
-def test_scale_error_of_a_current_is_within_the_systematic_uncertainty(scale: float) -> None:
+def test_scale_error_of_a_current_is_within_the_systematic_uncertainty(scale):
     # 4 %: the tolerance that a Hall sensor is sold with.
     made = motors.record("rear_left", seconds=3.0)
     assert made.current is not None
@@ -35,14 +35,14 @@ def test_scale_error_of_a_current_is_within_the_systematic_uncertainty(scale: fl
     assert share_of(found["motor_constant"], "current_scale") is None
 
 
-def test_accuracy_of_the_current_that_is_stated_replaces_the_assumed_one() -> None:
+def test_accuracy_of_the_current_that_is_stated_replaces_the_assumed_one():
     made = motors.record("rear_left", seconds=3.0)
     stated = replace(made, hardware=replace(made.hardware, current_accuracy=0.2))
     share = share_of(estimate(stated).parameters["resistance"], "current_scale")
     assert share is not None and share.share == pytest.approx(0.2)
 
 
-def test_gain_at_one_amplitude_is_sharp_and_states_where_it_holds() -> None:
+def test_gain_at_one_amplitude_is_sharp_and_states_where_it_holds():
     made = motors.record("rear_left", current=False, kinds=("square",), seconds=10.0)
     found = estimate(made)
     gain = found.combinations["dc_gain"]
@@ -58,14 +58,14 @@ def test_gain_at_one_amplitude_is_sharp_and_states_where_it_holds() -> None:
     assert measured is None or measured.size == pytest.approx(0.1 * one_size.size, rel=0.05)
 
 
-def test_a_motor_that_friction_nearly_holds_is_unreliable() -> None:
+def test_a_motor_that_friction_nearly_holds_is_unreliable():
     held = estimate(motors.record("rear_left", static_voltage=5.5, seconds=4.0))
     assert next(f for f in held.findings if f.code == "friction_dominates").severity == "unreliable"
     turns = estimate(motors.record("rear_left", static_voltage=4.5, seconds=4.0))
     assert "friction_dominates" not in [f.code for f in turns.findings]
 
 
-def test_instant_of_a_reading_is_within_the_systematic_uncertainty() -> None:
+def test_instant_of_a_reading_is_within_the_systematic_uncertainty():
     """A reading that is late by some of a row looks like as much less lag."""
     made = replace(motors.record("rear_left", current=False), velocity=None)
     known = replace(made, hardware=replace(made.hardware, timing_accuracy=0.0))

@@ -44,7 +44,7 @@ def filled(seconds: float, voltage: object = None, length: float = 60.0) -> Wind
     return window
 
 
-def test_record_is_at_the_motor_shaft_with_counts_unwrapped() -> None:
+def test_record_is_at_the_motor_shaft_with_counts_unwrapped():
     record = filled(20.0).record()
     assert record is not None
     assert record.current is None
@@ -57,7 +57,7 @@ def test_record_is_at_the_motor_shaft_with_counts_unwrapped() -> None:
     assert np.abs(moved - record.velocity[1:]).max() < 2 * np.pi / COUNTS / STEP * 1.01
 
 
-def test_voltages_that_differ_by_a_rounding_are_one_level() -> None:
+def test_voltages_that_differ_by_a_rounding_are_one_level():
     for volts in (12.0, -3.3, 1e-3):
         voltage = np.full(2000, volts)
         voltage[::7] = np.nextafter(volts, np.inf)
@@ -66,21 +66,21 @@ def test_voltages_that_differ_by_a_rounding_are_one_level() -> None:
 
 
 @pytest.mark.parametrize("volts", [np.nan, np.inf, -1e308, 1e308, 1e9])
-def test_an_impossible_voltage_is_not_a_sample(volts: float) -> None:
+def test_an_impossible_voltage_is_not_a_sample(volts):
     window = filled(20.0)
     before = len(window)
     window.add(NOW + 20 * SECOND, state(volts, np.nan, 0.0, 0.0, 0))
     assert len(window) == before and missing(window.record(), Demands()) == []
 
 
-def test_window_keeps_only_its_length() -> None:
+def test_window_keeps_only_its_length():
     window = filled(300.0, length=10.0)
     record = window.record()
     assert record is not None
     assert record.duration == pytest.approx(10.0, abs=2 * STEP)  # whole samples
 
 
-def test_a_gap_begins_a_segment_and_a_late_sample_is_left_out() -> None:
+def test_a_gap_begins_a_segment_and_a_late_sample_is_left_out():
     window = filled(5.0)
     before = len(window)
     window.add(NOW + 2 * SECOND, state(1.0, np.nan, 0.0, 0.0, 0))
@@ -92,7 +92,7 @@ def test_a_gap_begins_a_segment_and_a_late_sample_is_left_out() -> None:
     assert record.starts == (0, before)
 
 
-def test_samples_that_come_late_from_a_busy_machine_begin_no_segment() -> None:
+def test_samples_that_come_late_from_a_busy_machine_begin_no_segment():
     # Every fiftieth sample is taken six intervals late, and the next ones catch up.
     window = Window("front_left", 60.0)
     window.hardware = Hardware(RATIO, COUNTS, 16, 12.0)
@@ -108,20 +108,20 @@ def test_samples_that_come_late_from_a_busy_machine_begin_no_segment() -> None:
     assert record.starts == (0,)
 
 
-def test_a_clock_that_was_set_back_clears_the_window() -> None:
+def test_a_clock_that_was_set_back_clears_the_window():
     window = filled(5.0, length=3.0)
     window.add(NOW - 3600 * SECOND, state(1.0, np.nan, 0.0, 0.0, 0))
     assert len(window) == 1
 
 
-def test_samples_without_voltage_are_left_out() -> None:
+def test_samples_without_voltage_are_left_out():
     window = filled(1.0)
     before = len(window)
     window.add(NOW + 50 * SECOND, state(np.nan, np.nan, 0.0, 0.0, 0))
     assert len(window) == before
 
 
-def test_rich_motion_meets_every_demand() -> None:
+def test_rich_motion_meets_every_demand():
     assert missing(filled(10.0).record(), Demands()) == []
 
 
@@ -135,15 +135,15 @@ def test_rich_motion_meets_every_demand() -> None:
         (10.0, 5.0, "backward 0 %"),
     ],
 )
-def test_missing_excitation_is_named(seconds: float, voltage: float | None, word: str) -> None:
+def test_missing_excitation_is_named(seconds, voltage, word):
     assert word in "; ".join(missing(filled(seconds, voltage).record(), Demands()))
 
 
-def test_nothing_heard_is_named() -> None:
+def test_nothing_heard_is_named():
     assert missing(Window("w", 5.0).record(), Demands()) == ["no motor_state yet"]
 
 
-def test_demands_do_not_depend_on_the_unit_of_speed() -> None:
+def test_demands_do_not_depend_on_the_unit_of_speed():
     record = filled(10.0).record()
     assert record is not None
     slow = replace(record, velocity=record.velocity * 1e-6, count=None)

@@ -44,7 +44,7 @@ def stepped(at: float) -> np.ndarray:
 
 @pytest.mark.parametrize("at", [4.1, 9.3])
 @pytest.mark.parametrize("counts", [False, True])
-def test_a_load_that_steps_is_found_and_moves_no_number(counts: bool, at: float) -> None:
+def test_a_load_that_steps_is_found_and_moves_no_number(counts, at):
     found = estimate(recorded(stepped(at), counts=counts, seed=3))
     (words,) = [f for f in found.findings if f.code == "load_step"]
     assert abs(words.evidence["load_step_at"] * SECONDS - at) < 0.06 * SECONDS
@@ -60,22 +60,20 @@ def test_a_load_that_steps_is_found_and_moves_no_number(counts: bool, at: float)
 @pytest.mark.parametrize(
     ("counts", "back"), [(False, SECONDS), (True, SECONDS), (True, 9.4)]
 )  # fmt: skip
-def test_of_a_motor_that_turns_one_way_the_friction_is_not_told_from_loads(
-    counts: bool, back: float
-) -> None:
+def test_of_a_motor_that_turns_one_way_the_friction_is_not_told_from_loads(counts, back):
     """In one direction all the time, or reversed from the left-out part of the load on."""
     found = estimate(recorded(stepped(9.3), counts=counts, seed=5, least=3.0, back=back))
     gain, true = found.combinations["dc_gain"], motors.truth("rear_left", STATIC)["dc_gain"]
     assert abs(gain.value - true) < 4 * gain.std + 2e-3 * true
 
 
-def test_no_load_is_not_a_step() -> None:
+def test_no_load_is_not_a_step():
     found = estimate(recorded(np.zeros(RATE * SECONDS), counts=False, seed=4))
     assert "load_step" not in {f.code for f in found.findings}
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_an_angle_that_wanders_under_torque_noise_shows_no_step(seed: int) -> None:
+def test_an_angle_that_wanders_under_torque_noise_shows_no_step(seed):
     rng = np.random.default_rng(20 + seed)
     found = estimate(recorded(3.0 * rng.standard_normal(RATE * SECONDS), counts=True, seed=seed))
     codes = {f.code for f in found.findings}

@@ -6,7 +6,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -111,7 +110,7 @@ def codes(monitor: Monitor) -> set[str]:
     return {f.code for f in monitor.findings()}
 
 
-def test_values_stay_and_are_not_known_until_the_motor_moves() -> None:
+def test_values_stay_and_are_not_known_until_the_motor_moves():
     monitor = Monitor(MOTOR)
     for n in range(1000):
         monitor.add(n * STEP, 0.0, 0.001, 0.0)
@@ -120,7 +119,7 @@ def test_values_stay_and_are_not_known_until_the_motor_moves() -> None:
     assert not monitor.findings()
 
 
-def test_a_winding_that_heats_is_flagged_within_twenty_seconds_of_leaving_its_band() -> None:
+def test_a_winding_that_heats_is_flagged_within_twenty_seconds_of_leaving_its_band():
     def heat(motor: Motor, time: float) -> bool:
         motor.resistance = MOTOR.resistance * (1 + 0.2 * min(max(time - 30, 0) / 60, 1))
         return 30 <= time <= 91
@@ -139,7 +138,7 @@ def test_a_winding_that_heats_is_flagged_within_twenty_seconds_of_leaving_its_ba
     assert hot.evidence["warmer"] == pytest.approx(51, abs=13)
 
 
-def test_a_magnet_that_weakens_is_separated_from_heat() -> None:
+def test_a_magnet_that_weakens_is_separated_from_heat():
     def weaken(motor: Motor, time: float) -> bool:
         motor.constant = MOTOR.motor_constant * (1 - 0.05 * min(max(time - 30, 0) / 60, 1))
         return 30 <= time <= 91
@@ -149,7 +148,7 @@ def test_a_magnet_that_weakens_is_separated_from_heat() -> None:
     assert codes(monitor) == {"magnet_weak"}
 
 
-def test_friction_that_triples_is_told_from_both() -> None:
+def test_friction_that_triples_is_told_from_both():
     def drag(motor: Motor, time: float) -> bool:
         motor.friction = 3.0 if time >= 30 else 1.0
         return time == 30
@@ -159,13 +158,13 @@ def test_friction_that_triples_is_told_from_both() -> None:
     assert codes(monitor) == {"friction_high"}
 
 
-def test_half_an_hour_of_ordinary_driving_on_a_bad_day_raises_no_alarm() -> None:
+def test_half_an_hour_of_ordinary_driving_on_a_bad_day_raises_no_alarm():
     for time, monitor in followed(1800.0, bad_day=True):
         assert not codes(monitor), time
     assert {state for state, _ in monitor.validity().values()} == {"estimated"}
 
 
-def test_signals_that_contradict_each_other_are_invalid_and_not_an_alarm() -> None:
+def test_signals_that_contradict_each_other_are_invalid_and_not_an_alarm():
     rng = np.random.default_rng(0)
     monitor = Monitor(MOTOR)
     for n in range(6000):
@@ -176,12 +175,12 @@ def test_signals_that_contradict_each_other_are_invalid_and_not_an_alarm() -> No
     assert not monitor.findings()
 
 
-def test_invalid_commissioned_values_are_refused_by_name() -> None:
+def test_invalid_commissioned_values_are_refused_by_name():
     with pytest.raises(ParameterError, match="inertia"):
         replace(MOTOR, inertia=0.0)
 
 
-def test_a_history_reads_back_but_for_a_line_that_was_cut(tmp_path: Path) -> None:
+def test_a_history_reads_back_but_for_a_line_that_was_cut(tmp_path):
     *_, (_, monitor) = followed(60.0)
     file = tmp_path / "history.jsonl"
     entries = [history.entry_of(1e9 + 3600.0 * k, "front_left", monitor) for k in range(3)]
@@ -197,7 +196,7 @@ def test_a_history_reads_back_but_for_a_line_that_was_cut(tmp_path: Path) -> Non
         history.read(file)
 
 
-def test_a_motor_without_a_measured_current_cannot_be_watched() -> None:
+def test_a_motor_without_a_measured_current_cannot_be_watched():
     found = Estimate(wheel="left", model="second_order", parameters={}, combinations={})
     with pytest.raises(ParameterError, match="current"):
         commissioned_of(found)

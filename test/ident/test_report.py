@@ -8,7 +8,6 @@ import math
 import re
 from dataclasses import replace
 from html.parser import HTMLParser
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -66,7 +65,7 @@ def page() -> str:
     return render(Report(wheels, {"front_left": parts}, failures, {"Command": "identify a b"}))
 
 
-def test_page_loads_nothing_from_elsewhere(page: str) -> None:
+def test_page_loads_nothing_from_elsewhere(page):
     outside = Outside()
     outside.feed(page)
     assert outside.addresses == []
@@ -74,19 +73,19 @@ def test_page_loads_nothing_from_elsewhere(page: str) -> None:
     assert not re.search(r"url\((?!#)", page)
 
 
-def test_identifiers_of_the_figures_do_not_collide(page: str) -> None:
+def test_identifiers_of_the_figures_do_not_collide(page):
     outside = Outside()
     outside.feed(page)
     assert len(outside.identifiers) == len(set(outside.identifiers))
 
 
-def test_names_of_users_are_escaped(page: str) -> None:
+def test_names_of_users_are_escaped(page):
     assert "<script>alert" not in page
     assert "&lt;script&gt;" in page
     assert "<b>missed</b>" not in page
 
 
-def test_page_tells_failures_warnings_and_unidentifiable_parameters(page: str) -> None:
+def test_page_tells_failures_warnings_and_unidentifiable_parameters(page):
     assert "Voltage is constant; excite the motor." in page
     assert "look alike at 100 Hz" in page
     assert all(words.put_within(name) in page.split("Not identifiable")[1] for name in PHYSICAL)
@@ -96,9 +95,7 @@ def test_page_tells_failures_warnings_and_unidentifiable_parameters(page: str) -
     "named",
     [["time_constant"], ["dc_gain"], ["dc_gain", "time_constant"], []],
 )
-def test_a_finding_marks_its_quantities_unreliable_or_else_all(
-    named: list[str],
-) -> None:
+def test_a_finding_marks_its_quantities_unreliable_or_else_all(named):
     known = estimate(current=False)  # gain and time constant
     grave = Finding("code", "unreliable", "the data are poor", quantities=tuple(named))
     doubted = find_doubted(replace(known, findings=(*known.findings, grave)))
@@ -119,14 +116,12 @@ def test_a_finding_marks_its_quantities_unreliable_or_else_all(
         (Quantity(0.31, 0.0996, (0.11, 0.5), "1"), "0.31 ± 0.10", "0.11 … 0.50"),
     ],
 )
-def test_a_number_has_the_digits_that_its_deviation_allows(
-    quantity: Quantity, number: str, between: str
-) -> None:
+def test_a_number_has_the_digits_that_its_deviation_allows(quantity, number, between):
     assert words.state(quantity) == number
     assert words.interval(quantity) == between
 
 
-def test_every_colour_of_the_charts_is_a_variable_of_the_page(page: str) -> None:
+def test_every_colour_of_the_charts_is_a_variable_of_the_page(page):
     charts = json.loads(re.findall(r'id="charts">(.*?)</script>', page, re.DOTALL)[0])
     used = set(re.findall(r"var\(--([a-z0-9-]+)\)", page))
     used |= {curve["color"] for chart in charts for curve in chart["curves"]}
@@ -135,9 +130,7 @@ def test_every_colour_of_the_charts_is_a_variable_of_the_page(page: str) -> None
     assert used <= defined
 
 
-def test_each_chart_has_a_drawing_for_print_and_words_for_those_who_cannot_see_it(
-    page: str,
-) -> None:
+def test_each_chart_has_a_drawing_for_print_and_words_for_those_who_cannot_see_it(page):
     charts = json.loads(re.findall(r'id="charts">(.*?)</script>', page, re.DOTALL)[0])
     assert {chart["name"].split("-")[0] for chart in charts} >= {
         "speed", "residual", "voltage", "autocorrelation", "correlation", "gain", "phase",
@@ -158,7 +151,7 @@ def open_all(browser: Browser) -> None:
 
 
 @pytest.mark.skipif(not CHROMIUM, reason="no Chromium on this machine")
-def test_a_browser_draws_every_chart_zooms_and_asks_nobody(page: str, tmp_path: Path) -> None:
+def test_a_browser_draws_every_chart_zooms_and_asks_nobody(page, tmp_path):
     file = tmp_path / "report.html"
     file.write_text(page)
     with Browser(tmp_path / "profile") as browser:
@@ -185,9 +178,7 @@ def test_a_browser_draws_every_chart_zooms_and_asks_nobody(page: str, tmp_path: 
         assert set(browser.requests) == {file.as_uri()}
 
 
-def test_sliders_of_the_tuning_page_choose_designs_that_tune_has_made(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_sliders_of_the_tuning_page_choose_designs_that_tune_has_made(tmp_path, monkeypatch):
     monkeypatch.setattr(tuning_page, "BANDWIDTH_SHARES", (0.5, 1.0))
     monkeypatch.setattr(tuning_page, "PHASE_MARGINS", (60.0,))
     monkeypatch.setattr(tuning_page, "BAND_DRAWS", 20)
@@ -225,7 +216,7 @@ def page_wheels(tunings: dict[str, tuning_page.Tuning]) -> list[dict[str, Any]]:
     return list(tuning_page.page_data(tunings)["wheels"].values())
 
 
-def test_the_chart_of_the_residuals_shows_what_the_test_has_judged() -> None:
+def test_the_chart_of_the_residuals_shows_what_the_test_has_judged():
     tests = ResidualTests(False, True, correlation(0.5, 0.01), correlation(0.02, 0.01))
     own, cross = residual_charts("w", tests)
     assert own.lines == cross.lines == (-0.1, 0.0, 0.1)
@@ -236,7 +227,7 @@ def test_the_chart_of_the_residuals_shows_what_the_test_has_judged() -> None:
     assert np.isnan(cross.curves[1].y).all()  # independent: none outside
 
 
-def test_frequency_response_of_data_is_that_of_the_system_they_come_from() -> None:
+def test_frequency_response_of_data_is_that_of_the_system_they_come_from():
     # A first-order lag sampled exactly, under noise: gain k/|1 + j w tau| of the held input.
     k, tau, step, n = 25.0, 0.1, 0.005, 16_384
     rng = np.random.default_rng(11)
@@ -252,7 +243,7 @@ def test_frequency_response_of_data_is_that_of_the_system_they_come_from() -> No
     np.testing.assert_allclose(gain.curves[0].y[low], truth[low], rtol=0.01)
 
 
-def test_frequency_response_costs_nothing_for_a_pause_of_years() -> None:
+def test_frequency_response_costs_nothing_for_a_pause_of_years():
     whole = comparison("estimation")
     later = np.arange(whole.time.size) >= 2000
     part = replace(whole, time=whole.time + 1.7e9 * later)  # 340 billion intervals
@@ -262,13 +253,13 @@ def test_frequency_response_costs_nothing_for_a_pause_of_years() -> None:
 
 
 @pytest.mark.parametrize(("low", "high"), [(0.0, 46.0), (-3.2, 3.2), (1e-7, 2e-7)])
-def test_ticks_are_round_and_inside(low: float, high: float) -> None:
+def test_ticks_are_round_and_inside(low, high):
     found = ticks(low, high)
     assert 3 <= len(found) <= 12
     assert low <= found[0] < found[-1] <= high
 
 
-def test_thinning_keeps_peaks_and_order() -> None:
+def test_thinning_keeps_peaks_and_order():
     values = np.sin(np.arange(100_000) * 1e-3)
     values[54_321] = 9.0
     values[77] = np.nan

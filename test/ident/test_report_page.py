@@ -85,8 +85,8 @@ def tops(browser: Browser, *selectors: str) -> list[float]:
 @pytest.mark.parametrize(("width", "highest"), [(1280, 5000), (390, 12_000)])
 @pytest.mark.parametrize("dark", [False, True])
 def test_four_wheels_full_of_warnings_are_short_and_never_scroll_sideways(
-    browser: Browser, file: Path, width: int, highest: int, dark: bool
-) -> None:
+    browser, file, width, highest, dark
+):
     browser.open(file, width, dark=dark)
     # A phone of 390 px shows a third of 1280 px, so the limit of 5,000 is scaled.
     assert browser.value("document.documentElement.scrollHeight") <= highest
@@ -100,9 +100,7 @@ def test_four_wheels_full_of_warnings_are_short_and_never_scroll_sideways(
     assert browser.complaints == []
 
 
-def test_a_motor_is_told_in_the_order_of_its_readers_questions(
-    browser: Browser, file: Path
-) -> None:
+def test_a_motor_is_told_in_the_order_of_its_readers_questions(browser, file):
     browser.open(file, 390)
     order = tops(
         browser, "h1", "#side-by-side", "#front_left h2", "#front_left .values",
@@ -128,9 +126,7 @@ def row(browser: Browser, name: str) -> list[str]:
     return cells
 
 
-def test_the_card_names_unreliable_values_and_systematic_errors(
-    browser: Browser, file: Path
-) -> None:
+def test_the_card_names_unreliable_values_and_systematic_errors(browser, file):
     browser.open(file, 1280)
     verdict = browser.value("document.querySelector('#front_left .verdict').textContent")
     assert verdict == "Unreliable: time constant"
@@ -147,7 +143,7 @@ def test_the_card_names_unreliable_values_and_systematic_errors(
     assert "tune 'my results' --output gains.yaml --accept-unreliable" in gains
 
 
-def test_intervals_side_by_side_are_seen_on_an_axis(browser: Browser, file: Path) -> None:
+def test_intervals_side_by_side_are_seen_on_an_axis(browser, file):
     browser.open(file, 1280)
     compared: list[dict[str, Any]] = browser.value(
         "[...document.querySelectorAll('.compared')].map(f => ({name: f.querySelector('h3')"
@@ -168,8 +164,8 @@ def test_intervals_side_by_side_are_seen_on_an_axis(browser: Browser, file: Path
 
 
 def test_the_picture_begins_where_single_answers_are_seen_and_shows_all_on_request(
-    browser: Browser, tmp_path: Path
-) -> None:
+    browser, tmp_path
+):
     known = estimate()
     path = tmp_path / "report.html"
     path.write_text(render(Report({known.wheel: known}, {known.wheel: drive()})))

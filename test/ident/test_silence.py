@@ -88,7 +88,7 @@ def test_a_standstill_at_the_end_of_a_run_does_not_affect_the_next():
 
 
 @pytest.mark.parametrize("span", [(800, 1200), (500, 1400)])
-def test_a_motor_that_is_blocked_for_a_while_is_estimated_from_the_rest(span) -> None:
+def test_a_motor_that_is_blocked_for_a_while_is_estimated_from_the_rest(span):
     """A fifth of the record, and nearly half of it: it had been refused as a dead encoder."""
     volts = motors.independent.excitation(np.arange(2000) / 200.0, "fourier", 10.0)
     whole = motors.record("rear_left", current=False, voltage=volts, rate=200.0)

@@ -25,27 +25,27 @@ def kept(record: Record) -> list[int]:
     return [int(k) for k in np.flatnonzero(np.isfinite(prepare([record], False).motion))]
 
 
-def test_the_middle_sample_of_a_standstill_is_kept() -> None:
+def test_the_middle_sample_of_a_standstill_is_kept():
     moving, still = list(range(20)), [20] * 31
     assert kept(counted([*moving, *still, *range(21, 30)])) == [*range(20), 35, *range(51, 60)]
 
 
-def test_a_segment_that_begins_at_rest_keeps_its_first_sample() -> None:
+def test_a_segment_that_begins_at_rest_keeps_its_first_sample():
     counts = [0] * 30 + list(range(1, 11)) + [7] * 30 + list(range(8, 12))
     assert kept(counted(counts, (0, 40))) == [0, *range(30, 40), 40, *range(70, 74)]
 
 
-def test_slow_motion_is_unchanged() -> None:
+def test_slow_motion_is_unchanged():
     slow = [k // (REST - 1) for k in range(90)]
     assert kept(counted(slow)) == list(range(90))
 
 
 @pytest.mark.parametrize("rest", [REST, 10 * REST])
-def test_how_long_it_stands_adds_nothing(rest: int) -> None:
+def test_how_long_it_stands_adds_nothing(rest):
     assert len(kept(counted([0, 1, 2, *[3] * rest, 4, 5]))) == 6
 
 
-def test_a_motor_at_rest_with_a_noisy_angle_is_refused_despite_its_current() -> None:
+def test_a_motor_at_rest_with_a_noisy_angle_is_refused_despite_its_current():
     resistance, inductance, step = 4.0, 0.02, 0.01
     rng = np.random.default_rng(3)
     voltage = np.repeat(rng.choice([-0.1, 0.0, 0.1], 40), 15)

@@ -23,9 +23,7 @@ def found():
 
 
 @pytest.mark.parametrize(("rate", "most"), [(100.0, 0.010), (200.0, 0.005), (1000.0, 0.005)])
-def test_four_motors_under_uneven_load_settle_together_without_overshoot(
-    found, rate: float, most: float
-) -> None:
+def test_four_motors_under_uneven_load_settle_together_without_overshoot(found, rate, most):
     runs = TOGETHER.compare(ENTRIES, found, rate, seed=11)
     plain, arrival = (TOGETHER.assess(runs[way]) for way in ("plain", "together"))
     # The bounds: one control period, 5 ms at 1 kHz; overshoot below 1 %.

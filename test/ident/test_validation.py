@@ -24,7 +24,7 @@ def weaker(volts: np.ndarray, share: float, rate: float) -> Record:
 
 
 @pytest.mark.parametrize("share", [1.0, 0.7])
-def test_held_out_data_are_judged_by_what_their_sensor_can_show(share: float) -> None:
+def test_held_out_data_are_judged_by_what_their_sensor_can_show(share):
     if share == 1.0:  # a tail of a few counts is followed to a count: nothing speaks against it
         found = estimate(weaker(CHIRP, 1.0, RATE))
     else:

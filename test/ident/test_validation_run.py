@@ -18,7 +18,7 @@ def run(seed: int, error: float, gain: float = 1.0) -> Simulated:
     return Simulated(TIME, gain * SPEED + error * slow, SPEED)
 
 
-def test_a_motor_that_did_not_change_is_stated_and_rarely_refused() -> None:
+def test_a_motor_that_did_not_change_is_stated_and_rarely_refused():
     found = [judge("left", [run(2 * k, 5.0)], [run(2 * k + 1, 5.0)]) for k in range(200)]
     # One in a hundred by chance: more than seven of 200 have a probability of a thousandth.
     assert sum(f.severity == "refused" for f in found) <= 7
@@ -27,16 +27,16 @@ def test_a_motor_that_did_not_change_is_stated_and_rarely_refused() -> None:
     assert abs(found[0].evidence["fit_percent"] - 93.0) < 1.5
 
 
-def test_a_motor_that_changed_is_refused() -> None:
+def test_a_motor_that_changed_is_refused():
     found = judge("left", [run(1, 1.0)], [run(2, 1.0, gain=1.15)])
     assert found.severity == "refused" and found.code == "validation_run" and found.advice
 
 
-def test_what_costs_nothing_is_a_note_however_sure_it_is() -> None:
+def test_what_costs_nothing_is_a_note_however_sure_it_is():
     assert judge("left", [run(1, 0.01)], [run(2, 0.01, gain=1.02)]).severity == "note"
 
 
-def test_samples_that_are_missing_do_not_matter() -> None:
+def test_samples_that_are_missing_do_not_matter():
     hole = run(2, 1.0)
     hole.measured[500:700] = np.nan
     assert judge("left", [run(1, 1.0)], [hole]).severity == "note"

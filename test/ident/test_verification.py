@@ -71,21 +71,21 @@ def drive(
     )  # fmt: skip
 
 
-def test_a_wheel_that_does_as_designed_is_within_its_bands(designed: Design) -> None:
+def test_a_wheel_that_does_as_designed_is_within_its_bands(designed):
     change = drive(designed)
     assert v.judge([change]) == []
     # The prediction is the drive, but for the steps of the duty cycle.
     assert np.abs(change.nominal - change.speed).max() < 0.01 * change.setpoint
 
 
-def test_samples_that_come_late_are_in_the_prediction(designed: Design) -> None:
+def test_samples_that_come_late_are_in_the_prediction(designed):
     # A computer that is busy elsewhere: intervals scatter by a third.
     change = drive(designed, late=0.3 * STEP)
     assert v.judge([change]) == []
     assert np.abs(change.nominal - change.speed).max() < 0.02 * change.setpoint
 
 
-def test_samples_that_nobody_answered_are_in_the_prediction(designed: Design) -> None:
+def test_samples_that_nobody_answered_are_in_the_prediction(designed):
     loop = {"sample_time": STEP, "delay": STEP, "supply_voltage": 12.0}
     instants = STEP * np.arange(-60, 240)
     # 60 ms without an answer while the wheel gets faster: the voltage stays and is too large.
@@ -101,9 +101,7 @@ def test_samples_that_nobody_answered_are_in_the_prediction(designed: Design) ->
     assert rows[1][-1] == pytest.approx(1.0, abs=0.02)
 
 
-def test_what_the_integral_keeps_from_one_change_to_the_next_is_in_the_prediction(
-    designed: Design,
-) -> None:
+def test_what_the_integral_keeps_from_one_change_to_the_next_is_in_the_prediction(designed):
     # Friction of 2 V holds the wheel after each stop, so the integral stays.
     m = ENTRY.parameters
     rubbing = MotorParameters.from_combinations(
@@ -131,7 +129,7 @@ def test_what_the_integral_keeps_from_one_change_to_the_next_is_in_the_predictio
     assert np.abs(row - speed).max() < 0.02 * setpoint
 
 
-def test_how_long_a_command_waited_is_seen_in_the_voltages_that_were_applied() -> None:
+def test_how_long_a_command_waited_is_seen_in_the_voltages_that_were_applied():
     rng = np.random.default_rng(4)
     time = STEP * np.arange(200)
     commands, ages = rng.uniform(-10.0, 10.0, time.size), np.full(time.size, 0.001)
@@ -151,7 +149,7 @@ def test_how_long_a_command_waited_is_seen_in_the_voltages_that_were_applied() -
     assert np.array_equal(slower, np.full(time.size, STEP))
 
 
-def test_a_command_inside_the_dead_zone_of_a_driver_has_not_waited() -> None:
+def test_a_command_inside_the_dead_zone_of_a_driver_has_not_waited():
     # It drives, brakes, creeps up inside a zone of 1.5 V, and drives on.
     parts = (0.0, 60), (5.0, 100), (0.0, 1), (0.5, 100), (5.0, 100)
     commands = np.concatenate([np.full(lasts, volts) for volts, lasts in parts])
@@ -164,7 +162,7 @@ def test_a_command_inside_the_dead_zone_of_a_driver_has_not_waited() -> None:
     assert delays[1:].max() <= STEP + 1e-9
 
 
-def test_a_drive_that_its_computer_slowed_is_within_its_bands_and_says_so(designed: Design) -> None:
+def test_a_drive_that_its_computer_slowed_is_within_its_bands_and_says_so(designed):
     slow = drive(designed, wait=0.03)
     assert slow.reading.overshoot > 10.0
     assert v.judge([slow]) == []
@@ -177,7 +175,7 @@ def test_a_drive_that_its_computer_slowed_is_within_its_bands_and_says_so(design
 
 
 @pytest.mark.parametrize("gain", [0.6, 1.6])
-def test_another_motor_is_refused(designed: Design, gain: float) -> None:
+def test_another_motor_is_refused(designed, gain):
     motor = ENTRY.parameters
     other = replace(
         ENTRY,
@@ -190,25 +188,25 @@ def test_another_motor_is_refused(designed: Design, gain: float) -> None:
     assert all(f.severity == "refused" and WHEEL in f.message for f in found)
 
 
-def test_a_speed_that_stays_off_is_refused(designed: Design) -> None:
+def test_a_speed_that_stays_off_is_refused(designed):
     found = v.judge([drive(designed, offset=-0.05)])
     assert any("stays off" in f.message for f in found)
 
 
-def test_a_wheel_that_never_arrives_is_refused_in_words(designed: Design) -> None:
+def test_a_wheel_that_never_arrives_is_refused_in_words(designed):
     # Twice the torque of 12 V blocks the wheel.
     stall = 2.0 * ENTRY.gearbox.ratio * 12.0 * ENTRY.parameters.motor_constant
     found = v.judge([drive(designed, load=stall / ENTRY.parameters.resistance)])
     assert any("more than was recorded" in f.message for f in found)
 
 
-def test_a_drive_without_control_is_refused_with_its_reason() -> None:
+def test_a_drive_without_control_is_refused_with_its_reason():
     assert v.report_silence(0.09) == []
     (found,) = v.report_silence(0.4)
     assert found.severity == "refused" and "0.40 s" in found.message and found.advice
 
 
-def test_the_resolution_of_a_speed_is_that_of_its_parabola() -> None:
+def test_the_resolution_of_a_speed_is_that_of_its_parabola():
     # A staircase of counts from a slow wheel: the smoothed slope scatters as the formula says.
     quantum, speed = 0.01, 0.37
     time = np.arange(0.0, 20.0, STEP)

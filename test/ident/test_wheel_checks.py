@@ -80,7 +80,7 @@ def codes(*odd: Figures, hardware: Hardware = HARDWARE, **known: object) -> dict
     return {f.code: f.severity for f in found}
 
 
-def test_the_figures_are_those_of_the_motor() -> None:
+def test_the_figures_are_those_of_the_motor():
     # The speed of the last half of a hold has settled to exp(-5); counts resolve it to 0.1 %.
     assert GOOD.gain == pytest.approx(GAIN, rel=0.01)
     assert GOOD.friction == pytest.approx(FRICTION, abs=0.02)
@@ -93,21 +93,21 @@ def test_the_figures_are_those_of_the_motor() -> None:
     assert GOOD.rate == pytest.approx(1 / STEP) and GOOD.level == LEVELS[-1]
 
 
-def test_of_a_sound_robot_only_the_gear_ratio_is_left_open() -> None:
+def test_of_a_sound_robot_only_the_gear_ratio_is_left_open():
     assert codes() == {"gear_ratio_unknown": "note"}
     names = [f"wheel_{k}" for k in range(3)]
     known = {"gains": dict.fromkeys(names, 25.5), "ratios": dict.fromkeys(names, RATIO)}
     assert codes(**known) == {}
 
 
-def test_feedback_that_comes_too_seldom_or_late_is_refused() -> None:
+def test_feedback_that_comes_too_seldom_or_late_is_refused():
     assert codes(replace(GOOD, rate=20.0))["feedback_rate"] == "refused"
     assert codes(replace(GOOD, age=0.5))["feedback_age"] == "refused"
     assert codes(replace(GOOD, age=-3600.0))["feedback_age"] == "refused"
     assert codes(replace(GOOD, repeated=7))["repeated_stamps"] == "warning"
 
 
-def test_a_trembling_encoder_is_no_motion_and_a_turning_wheel_is() -> None:
+def test_a_trembling_encoder_is_no_motion_and_a_turning_wheel_is():
     assert "turns_at_rest" not in codes(replace(GOOD, at_rest=2.0))
     assert codes(replace(GOOD, at_rest=40.0))["turns_at_rest"] == "refused"
     seen, phases = trace(driven=False)
@@ -116,14 +116,14 @@ def test_a_trembling_encoder_is_no_motion_and_a_turning_wheel_is() -> None:
     assert math.isnan(still.breakaway) and still.direction == 0.0
 
 
-def test_a_wheel_that_does_not_turn_is_refused_by_name() -> None:
+def test_a_wheel_that_does_not_turn_is_refused_by_name():
     seen, phases = trace(driven=False)
     still = figures(seen, [p for p in phases if p.kind == "ramp"], HARDWARE)
     assert still.applied == pytest.approx(1.0)
     assert codes(still, moved={"wheel_0": {"wheel_0": 0.0}})["no_motion"] == "refused"
 
 
-def test_plugs_of_two_wheels_that_are_exchanged_are_separated_from_a_belt() -> None:
+def test_plugs_of_two_wheels_that_are_exchanged_are_separated_from_a_belt():
     (seen, phases), (still, _) = trace(), trace(driven=False)
     # Commands to the left turn the right.
     moved = count_coupled_motion({"left": still, "right": seen}, phases)
@@ -134,7 +134,7 @@ def test_plugs_of_two_wheels_that_are_exchanged_are_separated_from_a_belt() -> N
     assert {f.code: f.severity for f in judge(robot)}["coupled_wheels"] == "warning"
 
 
-def test_a_swapped_encoder_or_motor_is_refused_with_both_remedies() -> None:
+def test_a_swapped_encoder_or_motor_is_refused_with_both_remedies():
     wrong = shown(sign=-1.0)
     assert wrong.direction == -1.0
     (found,) = [
@@ -146,7 +146,7 @@ def test_a_swapped_encoder_or_motor_is_refused_with_both_remedies() -> None:
     assert "channels" in found.advice and "leads" in found.advice
 
 
-def test_a_gear_ratio_that_counts_or_a_motor_file_contradict_is_refused() -> None:
+def test_a_gear_ratio_that_counts_or_a_motor_file_contradict_is_refused():
     assert codes(shown(velocity_scale=0.75))["gear_ratio"] == "refused"
     assert codes(shown(velocity_scale=-1.0))["velocity_sign"] == "refused"
     assert codes(ratios={"wheel_0": 65.5})["gear_ratio"] == "refused"
@@ -155,14 +155,14 @@ def test_a_gear_ratio_that_counts_or_a_motor_file_contradict_is_refused() -> Non
     assert "unexpected_gain" not in codes(gains={"wheel_0": 1.2 * GAIN})
 
 
-def test_a_dead_zone_is_separated_from_friction() -> None:
+def test_a_dead_zone_is_separated_from_friction():
     wide = shown(dead=1.0 - 1e-6)
     # The ramp ends at 1 V; friction itself is 0.4 V.
     assert codes(replace(wide, breakaway=1.1))["dead_zone"] == "warning"
     assert "dead_zone" not in codes()
 
 
-def test_a_weak_battery_is_refused_by_what_arrives_or_what_it_says() -> None:
+def test_a_weak_battery_is_refused_by_what_arrives_or_what_it_says():
     weak = shown(applied=0.7)
     assert weak.applied == pytest.approx(0.7)
     # Friction and gain are of the voltage that arrives: the motor is the same.
@@ -174,7 +174,7 @@ def test_a_weak_battery_is_refused_by_what_arrives_or_what_it_says() -> None:
     assert codes(replace(GOOD, applied=0.0))["voltage_not_reported"] == "refused"
 
 
-def test_a_wheel_that_drags_is_separated_from_motors_that_scatter() -> None:
+def test_a_wheel_that_drags_is_separated_from_motors_that_scatter():
     assert codes(replace(GOOD, friction=5 * FRICTION))["unlike_sisters"] == "refused"
     heavier = codes(replace(GOOD, coast=5 * GOOD.coast))
     assert heavier["coasts_longer"] == "warning" and "unlike_sisters" not in heavier
@@ -188,13 +188,13 @@ def test_a_wheel_that_drags_is_separated_from_motors_that_scatter() -> None:
     assert "unlike_sisters" not in {f.code for f in found}
 
 
-def test_the_voltage_grows_until_friction_is_a_tenth_and_counts_are_enough() -> None:
+def test_the_voltage_grows_until_friction_is_a_tenth_and_counts_are_enough():
     assert answers_well(5.0, 0.5, 100.0)
     assert not answers_well(4.9, 0.5, 1000.0)
     assert not answers_well(5.0, 0.5, 99.0)
 
 
-def test_samples_that_wait_in_a_queue_show_the_same_motor() -> None:
+def test_samples_that_wait_in_a_queue_show_the_same_motor():
     # A busy computer takes samples 0.2 s late: a phase begins with samples of the one before.
     seen, phases = trace()
     late = np.concatenate([np.full(40, seen.phase[0]), seen.phase[:-40]])
@@ -205,7 +205,7 @@ def test_samples_that_wait_in_a_queue_show_the_same_motor() -> None:
     assert found.friction == pytest.approx(FRICTION, abs=0.032 * LEVELS[0])
 
 
-def test_a_wheel_has_not_settled_while_samples_are_of_the_voltage_before() -> None:
+def test_a_wheel_has_not_settled_while_samples_are_of_the_voltage_before():
     seen, phases = trace()
     first, second = (seen.during(p.number) for p in phases if p.kind == "hold" and p.level > 2.0)
     assert has_settled(first)
@@ -216,7 +216,7 @@ def test_a_wheel_has_not_settled_while_samples_are_of_the_voltage_before() -> No
     assert not has_settled(replace(first, command=second.command[: first.command.size]))
 
 
-def test_a_coast_begins_when_the_voltage_is_gone() -> None:
+def test_a_coast_begins_when_the_voltage_is_gone():
     seen, phases = trace()
     late = seen.voltage.copy()
     for hold, coast in itertools.pairwise(phases):
@@ -226,7 +226,7 @@ def test_a_coast_begins_when_the_voltage_is_gone() -> None:
     assert math.isnan(figures(replace(seen, voltage=late), phases, HARDWARE).coast)
 
 
-def test_samples_that_come_in_bunches_settle_nothing() -> None:
+def test_samples_that_come_in_bunches_settle_nothing():
     # Half-way up an exponential of 0.4 s: of the last tenth of the time come most samples.
     time = np.concatenate([np.linspace(0.0, 0.5, 6), np.linspace(0.5, 0.55, 40)[1:]])
     count = 1000.0 * (time - 0.4 * (1.0 - np.exp(-time / 0.4)))
@@ -241,7 +241,7 @@ def _rows(part: Trace) -> np.ndarray:
     return np.stack([getattr(part, name) for name in names], axis=1)
 
 
-def test_a_position_without_use_for_odometry_is_a_warning_of_its_wheel() -> None:
+def test_a_position_without_use_for_odometry_is_a_warning_of_its_wheel():
     found = judge(Robot({}, {}, positions={"left": "its position wraps", "right": ""}))
     assert [(f.code, f.severity, f.message) for f in found] == [
         ("position", "warning", "left: its position wraps")

@@ -28,9 +28,7 @@ def signal(rise: float, seed: int, friction: float = TC) -> Record:
 
 @pytest.mark.parametrize("seed", range(5))
 @pytest.mark.parametrize("friction", [TC, 5 * TC])
-def test_the_resistance_of_a_recording_is_the_windings_whatever_the_friction(
-    seed: int, friction: float
-) -> None:
+def test_the_resistance_of_a_recording_is_the_windings_whatever_the_friction(seed, friction):
     found = resistance(signal(0.1, seed, friction))
     assert found is not None
     assert found.value == pytest.approx(1.1 * R, abs=4 * found.std)
@@ -38,7 +36,7 @@ def test_the_resistance_of_a_recording_is_the_windings_whatever_the_friction(
 
 
 @pytest.mark.parametrize("rise", [0.3, 0.5])
-def test_a_winding_that_heats_ends_the_commissioning(rise: float) -> None:
+def test_a_winding_that_heats_ends_the_commissioning(rise):
     (finding,) = report_heated_winding("left", [signal(0.0, 1)], signal(rise, 2))
     assert finding.code == "winding_hot" and finding.severity == "refused"
     assert finding.evidence["warmer"] == pytest.approx(rise / 0.00393, rel=0.1)
@@ -46,17 +44,17 @@ def test_a_winding_that_heats_ends_the_commissioning(rise: float) -> None:
 
 
 @pytest.mark.parametrize("seed", range(20))
-def test_a_winding_that_warms_as_motors_do_does_not(seed: int) -> None:
+def test_a_winding_that_warms_as_motors_do_does_not(seed):
     assert not report_heated_winding("left", [signal(0.0, seed)], signal(0.1, 100 + seed))
 
 
-def test_without_a_current_nothing_is_known() -> None:
+def test_without_a_current_nothing_is_known():
     bare = replace(signal(0.5, 1), current=None)
     assert resistance(bare) is None
     assert not report_heated_winding("left", [signal(0.0, 1)], bare)
 
 
-def test_segments_and_lost_samples_are_left_out() -> None:
+def test_segments_and_lost_samples_are_left_out():
     record = signal(0.0, 3)
     current = record.current.copy()
     current[200:220] = np.nan

@@ -26,7 +26,7 @@ def bound_addresses(pid: int) -> set[str]:
     return found
 
 
-def test_nodes_bind_to_loopback_and_hear_each_other(process, node, eventually) -> None:
+def test_nodes_bind_to_loopback_and_hear_each_other(process, node, eventually):
     names = [("motor_plant",), ("skid_steer",), ("record", "--output", "bag")]
     wheels = [("wheel_pid", "--ros-args", "-r", f"__ns:=/front_{s}") for s in ("left", "right")]
     started = [process(*command) for command in (*names, *wheels)]
@@ -36,6 +36,6 @@ def test_nodes_bind_to_loopback_and_hear_each_other(process, node, eventually) -
         assert bound_addresses(one.pid) == {"127.0.0.1"}, one.command
 
 
-def test_another_middleware_gets_the_range_that_every_one_knows(monkeypatch) -> None:
+def test_another_middleware_gets_the_range_that_every_one_knows(monkeypatch):
     monkeypatch.setenv("RMW_IMPLEMENTATION", "rmw_cyclonedds_cpp")
     assert loopback.loopback_environment() == {"ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}

@@ -79,8 +79,8 @@ def listener(node: Node) -> Iterator[Listener]:
 
 
 def test_play_sends_the_recorded_bytes_at_their_times_and_they_are_recorded_again(
-    process: Process, listener: Listener, eventually: Callable[..., None], tmp_path: Path
-) -> None:
+    process, listener, eventually, tmp_path
+):
     written = write_bag(tmp_path / "bag")
     recorder = process("record", "-o", tmp_path / "again", "--regex", "/number|/text")
     eventually(lambda: "recording to" in recorder.output, deadline=20.0)
@@ -98,8 +98,8 @@ def test_play_sends_the_recorded_bytes_at_their_times_and_they_are_recorded_agai
 
 
 def test_play_goes_faster_from_an_offset_with_a_clock_and_chosen_topics(
-    process: Process, listener: Listener, tmp_path: Path
-) -> None:
+    process, listener, tmp_path
+):
     written = write_bag(tmp_path / "bag")
     arguments = ("--rate", "0.5", "--start-offset", "0.5", "--clock", "100", "--topics", "number")
     arguments += UNHURRIED
@@ -113,9 +113,7 @@ def test_play_goes_faster_from_an_offset_with_a_clock_and_chosen_topics(
     assert 40 <= len(listener.data["/clock"]) <= 110
 
 
-def test_play_loops_until_it_is_interrupted(
-    process: Process, listener: Listener, eventually: Callable[..., None], tmp_path: Path
-) -> None:
+def test_play_loops_until_it_is_interrupted(process, listener, eventually, tmp_path):
     written = write_bag(tmp_path / "bag", count=10)
     player = process("play", tmp_path / "bag", "--loop", "--rate", "2", *UNHURRIED)
     eventually(lambda: len(listener.data["/number"]) >= 25, deadline=20.0)
@@ -135,9 +133,7 @@ def test_play_loops_until_it_is_interrupted(
         (("bag", "--fast"), "unrecognized arguments"),
     ],
 )
-def test_play_refuses_invalid_arguments_in_one_line(
-    process: Process, tmp_path: Path, arguments: tuple[str, ...], reason: str
-) -> None:
+def test_play_refuses_invalid_arguments_in_one_line(process, tmp_path, arguments, reason):
     write_bag(tmp_path / "bag", count=3)
     player = process("play", *arguments)
     assert player.wait(20.0) == 2
@@ -146,8 +142,8 @@ def test_play_refuses_invalid_arguments_in_one_line(
 
 
 def test_types_that_cannot_be_played_are_told_and_the_other_messages_played(
-    process: Process, listener: Listener, eventually: Callable[..., None], tmp_path: Path
-) -> None:
+    process, listener, eventually, tmp_path
+):
     bag = tmp_path / "odd.mcap"
     with bag.open("wb") as file:
         writer = mcap.writer.Writer(file)

@@ -6,13 +6,9 @@ from __future__ import annotations
 import re
 import signal
 import time
-from collections.abc import Callable
 from itertools import chain
-from pathlib import Path
-from typing import Any
 
 import pytest
-from rclpy.node import Node
 from std_msgs.msg import Float64, String
 from traffic import (
     BEST_EFFORT,
@@ -33,12 +29,8 @@ from smp_motor_ident.errors import BagError
 
 @pytest.mark.parametrize("ending", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL])
 def test_four_wheels_at_a_kilohertz_are_recorded_without_a_lost_message(
-    node: Node,
-    process: Callable[..., Any],
-    eventually: Callable[..., None],
-    tmp_path: Path,
-    ending: signal.Signals,
-) -> None:
+    node, process, eventually, tmp_path, ending
+):
     bag = tmp_path / "bag"
     publishers = [node.create_publisher(MotorState, f"/{w}/motor_state", RELIABLE) for w in WHEELS]
     recorder = process("record", "--output", bag)
@@ -64,9 +56,7 @@ def test_four_wheels_at_a_kilohertz_are_recorded_without_a_lost_message(
     assert not any("missing" in f.message for f in records["front_left"].findings)
 
 
-def test_best_effort_messages_are_recorded_or_told_as_lost(
-    node: Node, process: Callable[..., Any], eventually: Callable[..., None], tmp_path: Path
-) -> None:
+def test_best_effort_messages_are_recorded_or_told_as_lost(node, process, eventually, tmp_path):
     bag = tmp_path / "bag"
     names = [f"/{wheel}/motor_state" for wheel in WHEELS]
     publishers = [node.create_publisher(MotorState, name, BEST_EFFORT) for name in names]
@@ -97,8 +87,8 @@ def test_best_effort_messages_are_recorded_or_told_as_lost(
 
 
 def test_late_publishers_latched_ones_and_mixed_qos_are_recorded(
-    node: Node, process: Callable[..., Any], eventually: Callable[..., None], tmp_path: Path
-) -> None:
+    node, process, eventually, tmp_path
+):
     bag = tmp_path / "bag"
     description = node.create_publisher(MotorDescription, "/w/motor_description", LATCHED)
     description.publish(MotorDescription(joint_name="early", gear_ratio=65.5))
@@ -132,9 +122,7 @@ def test_late_publishers_latched_ones_and_mixed_qos_are_recorded(
     assert sorted(found("/mixed")) == sorted(both[0] + both[1])
 
 
-def test_topics_are_chosen_by_name_and_pattern(
-    node: Node, process: Callable[..., Any], eventually: Callable[..., None], tmp_path: Path
-) -> None:
+def test_topics_are_chosen_by_name_and_pattern(node, process, eventually, tmp_path):
     names = ("/a/x", "/a/y", "/b/x", "/c")
     publishers = {name: node.create_publisher(Float64, name, LATCHED) for name in names}
     for publisher in publishers.values():
@@ -147,9 +135,7 @@ def test_topics_are_chosen_by_name_and_pattern(
     assert set(contents(bag)) == {"/a/x", "/c"}
 
 
-def test_a_bag_is_replaced_only_by_force_and_nothing_else_ever(
-    process: Callable[..., Any], eventually: Callable[..., None], tmp_path: Path
-) -> None:
+def test_a_bag_is_replaced_only_by_force_and_nothing_else_ever(process, eventually, tmp_path):
     bag, folder = tmp_path / "bag", tmp_path / "folder"
     with BagWriter(bag) as writer:
         writer.write("/old", "std_msgs/msg/Float64", bytes(12), 1)
@@ -173,7 +159,7 @@ def test_a_bag_is_replaced_only_by_force_and_nothing_else_ever(
     assert "/old" not in contents(bag)
 
 
-def test_message_of_another_type_than_its_topic_is_not_written(tmp_path: Path) -> None:
+def test_message_of_another_type_than_its_topic_is_not_written(tmp_path):
     with BagWriter(tmp_path / "bag") as bag:
         bag.write("/number", "std_msgs/msg/Float64", raw(Float64(data=4.0)), 1_000)
         with pytest.raises(BagError, match="is of the type std_msgs/msg/Float64, not"):

@@ -75,9 +75,7 @@ def used(make: Callable[[], Node], namespace: str, domain: int) -> tuple[str, Al
 
 
 @pytest.mark.parametrize(("namespace", "make"), NODES[3:], ids=lambda x: getattr(x, "__name__", ""))
-def test_the_policy_allows_a_node_the_topics_it_uses(
-    namespace, make, ros_domain, monkeypatch
-) -> None:
+def test_the_policy_allows_a_node_the_topics_it_uses(namespace, make, ros_domain, monkeypatch):
     monkeypatch.setattr(teleop_wheels, "Terminal", Mock())  # tests have no terminal
     path, access = used(make, namespace, ros_domain)
     rules = allowed()[path]
@@ -90,7 +88,7 @@ def test_the_policy_allows_a_node_the_topics_it_uses(
         assert not spare, f"{path} never uses {spare}"
 
 
-def test_the_wheels_may_do_alike_and_few_may_command_them() -> None:
+def test_the_wheels_may_do_alike_and_few_may_command_them():
     rules = allowed()
     wheels = [
         {

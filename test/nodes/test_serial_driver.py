@@ -119,9 +119,7 @@ def driver(board: Firmware, process: Callable[..., Any]) -> Callable[..., Any]:
     return lambda *more: process("serial_driver", *given, *more)
 
 
-def test_it_drives_through_lost_bytes_resets_and_unplugging(
-    board: Firmware, node: Node, driver: Callable[..., Any], eventually: Callable[..., None]
-) -> None:
+def test_it_drives_through_lost_bytes_resets_and_unplugging(board, node, driver, eventually):
     started = driver("-p", "encoder_bits:=16")
     seen: list[MotorState] = []
     node.create_subscription(MotorState, "left/motor_state", seen.append, 10)
@@ -187,8 +185,8 @@ def robot(node: Node) -> Any:
 # 36 V in 16 bits are -29536 mV; a divider may show anything.
 @pytest.mark.parametrize("battery", [-12000, -29536, -1, 65535, 10**17, 0, 40, ""])
 def test_no_supply_that_a_board_reports_turns_zero_into_motion(
-    board: Firmware, robot: Any, driver: Any, eventually: Any, battery: int | str
-) -> None:
+    board, robot, driver, eventually, battery
+):
     board.battery = battery
     started = driver()
     eventually(lambda: len(board.obeyed) > 30, 20.0, robot.drive, started.output)
@@ -202,9 +200,7 @@ def test_no_supply_that_a_board_reports_turns_zero_into_motion(
     eventually(lambda: any(words in m for m in robot.diagnoses), 5.0, robot.drive, robot.diagnoses)
 
 
-def test_a_suspended_board_gets_few_outdated_commands(
-    board: Firmware, robot: Any, driver: Any, eventually: Any
-) -> None:
+def test_a_suspended_board_gets_few_outdated_commands(board, robot, driver, eventually):
     started = driver()
     robot.voltage = 3.0
     eventually(lambda: board.voltages == [3.0, 3.0], 20.0, robot.drive, started.output)
@@ -223,8 +219,8 @@ def test_a_suspended_board_gets_few_outdated_commands(
 
 
 def test_every_command_follows_the_clock_of_the_sample_that_it_answers(
-    board: Firmware, robot: Any, driver: Any, eventually: Any
-) -> None:
+    board, robot, driver, eventually
+):
     told: list[tuple[int, float]] = []
 
     def listen(lines: LineSplitter, now: float) -> None:
@@ -243,9 +239,7 @@ def test_every_command_follows_the_clock_of_the_sample_that_it_answers(
     assert ages[0] > 0.0 and ages[len(ages) // 2] < 0.1
 
 
-def test_lines_that_no_board_sends_end_nothing(
-    board: Firmware, robot: Any, driver: Any, eventually: Any
-) -> None:
+def test_lines_that_no_board_sends_end_nothing(board, robot, driver, eventually):
     started = driver()
     eventually(lambda: len(robot.seen) > 5, 20.0, robot.drive, started.output)
     long = "9" * 400
@@ -262,9 +256,7 @@ def test_lines_that_no_board_sends_end_nothing(
     assert started.returncode is None
 
 
-def test_a_device_that_is_not_a_terminal_is_named_and_closed(
-    tmp_path: Path, robot: Any, process: Any, eventually: Any
-) -> None:
+def test_a_device_that_is_not_a_terminal_is_named_and_closed(tmp_path, robot, process, eventually):
     (tmp_path / "notes.txt").write_text("no terminal\n")
     started = process("serial_driver", *options(f"device:={tmp_path / 'notes.txt'}"))
     eventually(lambda: robot.diagnoses, 20.0, robot.drive, started.output)
@@ -275,9 +267,7 @@ def test_a_device_that_is_not_a_terminal_is_named_and_closed(
     assert open_files() <= before  # six tries later
 
 
-def test_a_device_that_another_program_has_is_left_alone(
-    board: Firmware, robot: Any, driver: Any, eventually: Any
-) -> None:
+def test_a_device_that_another_program_has_is_left_alone(board, robot, driver, eventually):
     driver()
     eventually(lambda: len(robot.seen) > 5, 20.0, robot.drive)
     driver("-r", "__ns:=/second")
@@ -304,12 +294,12 @@ def test_a_device_that_another_program_has_is_left_alone(
         ({"encoder_bits": 1}, "encoder_bits is 1"),
     ],
 )
-def test_options_that_no_board_has_are_refused(given: dict[str, Any], words: str) -> None:
+def test_options_that_no_board_has_are_refused(given, words):
     with pytest.raises(ParameterError, match=words):
         Settings(**given)
 
 
-def test_a_line_that_was_spoilt_is_never_taken() -> None:
+def test_a_line_that_was_spoilt_is_never_taken():
     line = encode("S,1000,12000,17,250,-4,").decode().strip()
     assert decode_state(line, 2).counts == (17, -4)
     assert math.isnan(decode_state(line, 2).currents[1])

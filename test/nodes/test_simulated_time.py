@@ -5,9 +5,7 @@ from __future__ import annotations
 
 import itertools
 import time
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import pytest
 from diagnostic_msgs.msg import DiagnosticArray
@@ -31,8 +29,8 @@ MISSING = "/clock is not published"
 
 
 def test_a_missing_clock_is_named_by_every_node_and_a_present_one_followed(
-    process: Callable[..., Any], node: Node, eventually: Callable[..., None]
-) -> None:
+    process, node, eventually
+):
     said: dict[str, str] = {}
 
     def listen(message: DiagnosticArray) -> None:
@@ -90,9 +88,7 @@ def stamp(message: MotorState) -> float:
 
 
 @pytest.mark.parametrize("factor", [0.5, 2.0])
-def test_simulated_motors_move_in_simulated_time(
-    process: Callable[..., Any], node: Node, eventually: Callable[..., None], factor: float
-) -> None:
+def test_simulated_motors_move_in_simulated_time(process, node, eventually, factor):
     """At 1 rad/s of simulated time, whatever passes outside, and without a fault."""
     states: list[MotorState] = []
     said: dict[str, str] = {}

@@ -23,7 +23,7 @@ BEHAVIOUR = json.loads(
 )["behaviour_cases"]
 
 
-def test_only_a_sound_and_fresh_command_starts_the_wheels(skid_steer, peer, eventually) -> None:
+def test_only_a_sound_and_fresh_command_starts_the_wheels(skid_steer, peer, eventually):
     started = skid_steer()
     eventually(lambda: peer.diagnosis(""), deadline=5.0, step=peer.spin)
     for _ in range(8):
@@ -45,9 +45,7 @@ def test_only_a_sound_and_fresh_command_starts_the_wheels(skid_steer, peer, even
     assert started.output.count("stamp is zero") == 1
 
 
-def test_command_turns_all_four_wheels_and_its_timeout_stops_them(
-    skid_steer, peer, eventually
-) -> None:
+def test_command_turns_all_four_wheels_and_its_timeout_stops_them(skid_steer, peer, eventually):
     skid_steer()
     repeatedly(peer, lambda: peer.command(0.0, 1.0), lambda: peer.drives(-2.0, 2.0), eventually)
     assert set(peer.speeds()) == set(JOINTS)
@@ -76,9 +74,7 @@ def test_command_turns_all_four_wheels_and_its_timeout_stops_them(
     repeatedly(peer, lambda: peer.command(1.0), lambda: peer.drives(10.0, 10.0), eventually, 1.0)
 
 
-def test_plain_and_stamped_twist_are_understood_one_after_the_other(
-    skid_steer, peer, eventually
-) -> None:
+def test_plain_and_stamped_twist_are_understood_one_after_the_other(skid_steer, peer, eventually):
     skid_steer("-r", "cmd_vel:=cmd_vel_plain", listens="cmd_vel_plain")
     message = Twist()
     message.linear.x = 1.0
@@ -92,7 +88,7 @@ def test_plain_and_stamped_twist_are_understood_one_after_the_other(
     repeatedly(peer, lambda: peer.command(0.5), lambda: peer.drives(5.0, 5.0), eventually)
 
 
-def test_another_type_that_is_published_too_is_named(skid_steer, peer, process, eventually) -> None:
+def test_another_type_that_is_published_too_is_named(skid_steer, peer, process, eventually):
     skid_steer()
     program = (
         "import rclpy, time\nfrom geometry_msgs.msg import Twist\nrclpy.init()\n"
@@ -104,7 +100,7 @@ def test_another_type_that_is_published_too_is_named(skid_steer, peer, process, 
     assert peer.drives(5.0, 5.0)
 
 
-def test_silence_brakes_within_the_limits(skid_steer, peer, eventually) -> None:
+def test_silence_brakes_within_the_limits(skid_steer, peer, eventually):
     """ros-navigation/navigation2 issue 3481: a time-out that stops at once."""
     skid_steer("-p", "linear.x.max_acceleration:=1.0")
     repeatedly(peer, lambda: peer.command(0.5), lambda: peer.drives(5.0, 5.0), eventually)
@@ -119,9 +115,7 @@ def test_silence_brakes_within_the_limits(skid_steer, peer, eventually) -> None:
 @pytest.mark.parametrize(
     "limit", ["linear.x.max_acceleration:=0.01", "linear.x.max_jerk:=0.01", "stop_time:=0.3"]
 )
-def test_a_body_stands_in_its_stop_time_whatever_its_limits(
-    skid_steer, peer, eventually, limit
-) -> None:
+def test_a_body_stands_in_its_stop_time_whatever_its_limits(skid_steer, peer, eventually, limit):
     """A command of 0.5 m/s that it reached without limits, then zero under the limit."""
     skid_steer()
     repeatedly(peer, lambda: peer.command(0.5), lambda: peer.drives(5.0, 5.0), eventually)
@@ -141,7 +135,7 @@ def test_a_body_stands_in_its_stop_time_whatever_its_limits(
 
 def test_parameters_change_while_driving_and_nonsense_is_refused_with_its_reason(
     skid_steer, peer, eventually
-) -> None:
+):
     skid_steer("-p", "linear.x.max_acceleration:=0.5")
     repeatedly(peer, lambda: peer.command(0.5), lambda: peer.drives(5.0, 5.0), eventually)
     stamps = [m.header.stamp.sec + 1e-9 * m.header.stamp.nanosec for m in peer.setpoints]
@@ -175,7 +169,7 @@ def test_parameters_change_while_driving_and_nonsense_is_refused_with_its_reason
     )
 
 
-def test_heading_is_held_by_the_imu_and_only_while_driving(skid_steer, peer, eventually) -> None:
+def test_heading_is_held_by_the_imu_and_only_while_driving(skid_steer, peer, eventually):
     # A busy machine must not let the imu or the command time out: the hold would begin anew.
     patient = ("-p", "imu_timeout:=60.0", "-p", "cmd_vel_timeout:=60.0")
     skid_steer("-p", "heading_hold:=true", "-p", "heading_i:=0.0", *patient)
@@ -202,7 +196,7 @@ def test_heading_is_held_by_the_imu_and_only_while_driving(skid_steer, peer, eve
 
 
 @pytest.mark.parametrize("end", ["interrupt", "terminate"])
-def test_wheels_are_left_at_zero_on_exit(skid_steer, peer, eventually, end: str) -> None:
+def test_wheels_are_left_at_zero_on_exit(skid_steer, peer, eventually, end):
     started = skid_steer()
     repeatedly(peer, lambda: peer.command(0.5), lambda: peer.drives(5.0, 5.0), eventually)
     if end == "interrupt":
@@ -217,6 +211,6 @@ def test_wheels_are_left_at_zero_on_exit(skid_steer, peer, eventually, end: str)
 @pytest.mark.parametrize(
     "row", next(case["table"] for case in BEHAVIOUR if case["id"] == "frame_prefix"), ids=str
 )
-def test_frames_are_prefixed_as_by_diff_drive_controller(row: dict) -> None:
+def test_frames_are_prefixed_as_by_diff_drive_controller(row):
     prefix = frame_prefix(row["enable"], row["prefix"], row["ns"] or "/")
     assert prefix + "odom" == row["odom"]

@@ -14,7 +14,7 @@ from rosgraph_msgs.msg import Clock
 from smp_interfaces.msg import MotorState
 
 
-def test_odometry_follows_simulated_time_at_half_the_pace(skid_steer, peer, eventually) -> None:
+def test_odometry_follows_simulated_time_at_half_the_pace(skid_steer, peer, eventually):
     """At 1 rad/s of simulated time the body moves at 0.1 m/s of it, whatever passes outside."""
     clock = peer.node.create_publisher(Clock, "/clock", 10)
     skid_steer("-p", "use_sim_time:=true")
@@ -45,7 +45,7 @@ def test_odometry_follows_simulated_time_at_half_the_pace(skid_steer, peer, even
     assert peer.odometry[-1].pose.pose.position.x < 0.1 * 0.5 * (time.monotonic() - begun) + 0.01
 
 
-def test_odometry_goes_on_when_the_clock_is_set_back(skid_steer, peer, eventually) -> None:
+def test_odometry_goes_on_when_the_clock_is_set_back(skid_steer, peer, eventually):
     """ros-controls/ros_controllers issue 101: silence until the clock has caught up."""
     clock = peer.node.create_publisher(Clock, "/clock", 10)
     skid_steer("-p", "use_sim_time:=true")
@@ -72,7 +72,7 @@ def test_odometry_goes_on_when_the_clock_is_set_back(skid_steer, peer, eventuall
         assert abs(peer.odometry[-1].twist.twist.linear.x) < 0.2
 
 
-def test_a_body_that_stands_has_no_speed_at_all(skid_steer, peer, eventually) -> None:
+def test_a_body_that_stands_has_no_speed_at_all(skid_steer, peer, eventually):
     """ros-controls/ros2_controllers issue 1972: 5e-14 m/s for ever."""
     skid_steer()
     repeatedly(peer, lambda: peer.roll(2.0), lambda: len(peer.odometry) > 30, eventually)
@@ -83,7 +83,7 @@ def test_a_body_that_stands_has_no_speed_at_all(skid_steer, peer, eventually) ->
     assert (last.linear.x, last.angular.z) == (0.0, 0.0)
 
 
-def test_odometry_has_no_spikes_after_stalls(skid_steer, peer, eventually) -> None:
+def test_odometry_has_no_spikes_after_stalls(skid_steer, peer, eventually):
     """The reference is the speed of the wheels as they are fed: 2 rad/s, 0.2 m/s."""
     started = skid_steer()
 
@@ -105,7 +105,7 @@ def test_odometry_has_no_spikes_after_stalls(skid_steer, peer, eventually) -> No
     assert max(speeds) < 1.2 * 0.2
 
 
-def test_odometry_follows_the_wheels_from_any_first_position(skid_steer, peer, eventually) -> None:
+def test_odometry_follows_the_wheels_from_any_first_position(skid_steer, peer, eventually):
     skid_steer("-p", "feedback_timeout:=60.0")
     # Wheels that start at 1000 and 2000 rad, and then roll 1 rad: 0.1 m.
     repeatedly(
@@ -133,7 +133,7 @@ def test_odometry_follows_the_wheels_from_any_first_position(skid_steer, peer, e
     assert sorted(peer.joints[-1].name) == sorted(JOINTS)
 
 
-def test_odometry_is_also_on_tf_where_tf2_msgs_is_installed(skid_steer, peer, eventually) -> None:
+def test_odometry_is_also_on_tf_where_tf2_msgs_is_installed(skid_steer, peer, eventually):
     tf2_msgs = pytest.importorskip("tf2_msgs.msg", reason="tf2_msgs is not among the wheels")
     seen: list = []
     peer.node.create_subscription(
@@ -155,9 +155,7 @@ def test_odometry_is_also_on_tf_where_tf2_msgs_is_installed(skid_steer, peer, ev
     assert same[0].pose.pose.orientation == seen[-1].transform.rotation
 
 
-def test_lost_or_nan_feedback_is_named_and_never_reaches_the_odometry(
-    skid_steer, peer, eventually
-) -> None:
+def test_lost_or_nan_feedback_is_named_and_never_reaches_the_odometry(skid_steer, peer, eventually):
     skid_steer()
     repeatedly(peer, lambda: peer.feed_all(0.0, 0.0), lambda: peer.odometry, eventually)
 

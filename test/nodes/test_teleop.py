@@ -136,7 +136,7 @@ def hold(key: str, shell: Terminal, robot: Listener, condition, eventually) -> N
     eventually(condition, deadline=5.0, step=press)
 
 
-def test_held_key_drives_and_its_release_stops_then_is_silent(ready, robot, eventually) -> None:
+def test_held_key_drives_and_its_release_stops_then_is_silent(ready, robot, eventually):
     shell = ready()
     robot.spin_for(0.3)
     assert robot.twists == []
@@ -155,7 +155,7 @@ def test_held_key_drives_and_its_release_stops_then_is_silent(ready, robot, even
     eventually(lambda: "stopped" in shell.shown)
 
 
-def test_wheel_mode_turns_the_selected_wheel_and_space_stops_it(ready, robot, eventually) -> None:
+def test_wheel_mode_turns_the_selected_wheel_and_space_stops_it(ready, robot, eventually):
     shell = ready()
     shell.type("m2++")
     hold(
@@ -184,9 +184,7 @@ def test_wheel_mode_turns_the_selected_wheel_and_space_stops_it(ready, robot, ev
     ],
     ids=["x", "Ctrl-C", "Ctrl-backslash", "SIGTERM", "SIGHUP"],
 )
-def test_leaving_stops_the_robot_and_restores_the_terminal(
-    ready, robot, eventually, leave: str | int
-) -> None:
+def test_leaving_stops_the_robot_and_restores_the_terminal(ready, robot, eventually, leave):
     shell = ready()
     hold("w", shell, robot, lambda: robot.linear() == 0.2, eventually)
     if isinstance(leave, str):
@@ -203,7 +201,7 @@ def test_leaving_stops_the_robot_and_restores_the_terminal(
 
 def test_suspending_stops_and_restores_and_continuing_takes_the_keys_again(
     ready, robot, eventually
-) -> None:
+):
     shell = ready()
     hold("w", shell, robot, lambda: robot.linear() == 0.2, eventually)
     shell.type("\x1a")
@@ -217,7 +215,7 @@ def test_suspending_stops_and_restores_and_continuing_takes_the_keys_again(
     assert shell.process.poll() is None
 
 
-def test_exception_in_the_node_restores_the_terminal(terminal, eventually) -> None:
+def test_exception_in_the_node_restores_the_terminal(terminal, eventually):
     script = (
         "import smp_motor_control.nodes.teleop_wheels as t, sys\n"
         "def fail(self, *_): raise RuntimeError('broken')\n"
@@ -231,7 +229,7 @@ def test_exception_in_the_node_restores_the_terminal(terminal, eventually) -> No
     eventually(lambda: "broken" in shell.shown)
 
 
-def test_impossible_speed_is_refused_and_the_terminal_left_alone(terminal, eventually) -> None:
+def test_impossible_speed_is_refused_and_the_terminal_left_alone(terminal, eventually):
     shell = terminal("teleop_wheels", "--ros-args", "-p", "linear_speed:=-1.0")
     eventually(lambda: shell.process.poll() is not None, deadline=20.0)
     assert shell.process.returncode == 2

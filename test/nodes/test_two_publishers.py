@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 
 import pytest
 from diagnostic_msgs.msg import DiagnosticArray
@@ -89,9 +89,7 @@ def names(*parameters: str) -> list[str]:
     return ["--ros-args", *(part for one in parameters for part in ("-p", one))]
 
 
-def test_every_reader_names_both_and_the_wheel_stands(
-    process: Callable, robot: Robot, eventually: Callable
-) -> None:
+def test_every_reader_names_both_and_the_wheel_stands(process, robot, eventually):
     process("wheel_pid", *STUCK)
     process("skid_steer", *names("left_wheel_names:=[left]", "right_wheel_names:=[right]"))
     process("identifier", *names("wheels:=[left]", "period:=0.5"))
@@ -116,9 +114,7 @@ def test_every_reader_names_both_and_the_wheel_stands(
     eventually(lambda: robot.voltages[-1] > 0.0, 20.0, robot.run)
 
 
-def test_two_that_command_the_wheels_at_once_are_named(
-    process: Callable, robot: Robot, eventually: Callable
-) -> None:
+def test_two_that_command_the_wheels_at_once_are_named(process, robot, eventually):
     process("wheel_pid", "--ros-args", "-r", "__ns:=/left", "-p", "p:=2.0")
     eventually(lambda: "left/wheel_pid" in robot.said, 20.0, robot.run)
     robot.forget()
@@ -129,9 +125,7 @@ def test_two_that_command_the_wheels_at_once_are_named(
 
 
 @pytest.mark.parametrize("wait", [True, False])
-def test_a_client_refuses_a_wheel_of_two_publishers(
-    robot: Robot, eventually: Callable, wait: bool
-) -> None:
+def test_a_client_refuses_a_wheel_of_two_publishers(robot, eventually, wait):
     with RobotClient(name="tool") as client:
         client.node.create_timer(0.01, robot.run)
         assert client.wait_for_wheels(WHEELS, 20.0)["left"] > 5.0
@@ -145,9 +139,7 @@ def test_a_client_refuses_a_wheel_of_two_publishers(
                     client.refuse_second_reporters(WHEELS)
 
 
-def test_states_without_a_stamp_are_named_and_refused_by_tools(
-    process: Callable, robot: Robot, eventually: Callable
-) -> None:
+def test_states_without_a_stamp_are_named_and_refused_by_tools(process, robot, eventually):
     robot.driver.stamped = False
     process("wheel_pid", *STUCK)
     process("skid_steer", *names("left_wheel_names:=[left]", "right_wheel_names:=[right]"))
@@ -163,7 +155,7 @@ def test_states_without_a_stamp_are_named_and_refused_by_tools(
             client.wait_for_wheels(["left"], 20.0)
 
 
-def test_numbers_that_fall_once_are_of_a_publisher_that_was_started_anew() -> None:
+def test_numbers_that_fall_once_are_of_a_publisher_that_was_started_anew():
     watch = PublisherWatch()
     for start in range(DECISIVE_FALLS - 1):
         assert watch.hear({"publication_sequence_number": 1}) is bool(start)
@@ -176,7 +168,7 @@ def test_numbers_that_fall_once_are_of_a_publisher_that_was_started_anew() -> No
     assert watch.has_two_publishers
 
 
-def test_a_middleware_without_numbers_tells_nothing() -> None:
+def test_a_middleware_without_numbers_tells_nothing():
     watch = PublisherWatch()
     for _ in range(100):
         assert not watch.hear({"publication_sequence_number": None})

@@ -28,10 +28,10 @@ def recording(position) -> WheelRecording:
         (lambda angle: angle if angle < 9.0 else angle - 9.0, "jumped"),
     ],
 )
-def test_a_position_that_no_odometry_can_use_is_named(position, words: str) -> None:
+def test_a_position_that_no_odometry_can_use_is_named(position, words):
     said = recording(position).position_problem()
     assert words in said and bool(words) is bool(said)
 
 
-def test_an_empty_recording_has_no_problem() -> None:
+def test_an_empty_recording_has_no_problem():
     assert WheelRecording().position_problem() == ""

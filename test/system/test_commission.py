@@ -11,7 +11,6 @@ from typing import Any
 
 import pytest
 import yaml
-from wheel_robot import WheelRobot
 
 from smp_motor_control import WHEELS
 from smp_motor_ident.report.document import read_identification
@@ -30,8 +29,8 @@ BUSY = (
 
 
 def test_it_checks_identifies_tunes_and_drives_the_running_robot(
-    process: Process, robot: WheelRobot, eventually: Callable[..., None], tmp_path: Path
-) -> None:
+    process, robot, eventually, tmp_path
+):
     paper = yaml.safe_load((ROOT / "config" / "motors_paper.yaml").read_text())
     motors = paper["/**/motor_plant"]["ros__parameters"]["motors"]
     for wheel in set(motors) - set(TWO):
@@ -67,9 +66,7 @@ def test_it_checks_identifies_tunes_and_drives_the_running_robot(
     assert robot.velocity("front_left") == pytest.approx(1.0, abs=0.1)
 
 
-def test_gains_are_driven_on_a_new_controller_if_none_runs(
-    process: Process, robot: WheelRobot, eventually: Callable[..., None], tmp_path: Path
-) -> None:
+def test_gains_are_driven_on_a_new_controller_if_none_runs(process, robot, eventually, tmp_path):
     namespace = ("--ros-args", "-r", "__ns:=/robot1")
     process("motor_plant", *namespace)
     heard = robot.node.count_publishers
@@ -95,8 +92,8 @@ def test_gains_are_driven_on_a_new_controller_if_none_runs(
 
 
 def test_two_robots_on_one_topic_are_named_before_anything_moves(
-    process: Process, robot: WheelRobot, eventually: Callable[..., None], tmp_path: Path
-) -> None:
+    process, robot, eventually, tmp_path
+):
     process("motor_plant")
     process("motor_plant", "--ros-args", "-r", "__node:=forgotten_plant")
     count = robot.node.count_publishers
@@ -108,9 +105,7 @@ def test_two_robots_on_one_topic_are_named_before_anything_moves(
     assert not (tmp_path / "r").exists()
 
 
-def test_a_killed_commission_leaves_the_controllers_as_they_were(
-    process: Process, robot: WheelRobot, eventually: Callable[..., None]
-) -> None:
+def test_a_killed_commission_leaves_the_controllers_as_they_were(process, robot, eventually):
     process("motor_plant")
     gains = ("-p", "p:=2.0", "-p", "i:=40.0")
     process("wheel_pid", "--ros-args", "-r", "__ns:=/rear_left", *gains)
@@ -129,9 +124,7 @@ def test_a_killed_commission_leaves_the_controllers_as_they_were(
     eventually(follows, 15.0, robot.spin, "the controller is not active again")
 
 
-def test_nothing_moves_without_a_word(
-    process: Process, robot: WheelRobot, eventually: Callable[..., None], tmp_path: Path
-) -> None:
+def test_nothing_moves_without_a_word(process, robot, eventually, tmp_path):
     process("motor_plant")
     eventually(lambda: all(robot.states[w] for w in WHEELS), 30.0, robot.spin, "no robot")
     tool = process("commission", "--output", "r")
@@ -142,7 +135,7 @@ def test_nothing_moves_without_a_word(
     assert not (tmp_path / "r").exists()
 
 
-def test_a_robot_that_is_not_there_is_named(process: Process, tmp_path: Path) -> None:
+def test_a_robot_that_is_not_there_is_named(process, tmp_path):
     tool = process("commission", "--output", "r", "--yes", "--wheel", "rear_left")
     assert tool.wait(60.0) == 1
     assert "/rear_left/motor_state" in tool.output

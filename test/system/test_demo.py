@@ -10,9 +10,8 @@ import re
 import signal
 import time
 import uuid
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 from xml.etree import ElementTree
 
 import pytest
@@ -85,9 +84,7 @@ def assert_page_shows(output: str, *, idle: bool) -> None:
 
 @pytest.mark.alone
 @pytest.mark.slow
-def test_the_demo_shows_everything_and_leaves_nothing_running(
-    process: Callable[..., Any], mark: str, tmp_path: Path
-) -> None:
+def test_the_demo_shows_everything_and_leaves_nothing_running(process, mark, tmp_path):
     idle = os.getloadavg()[0] < 1.0
     begun = time.monotonic()
     demo = process("demo", "--output", "result", env={"SMP_MARK": mark})
@@ -114,9 +111,7 @@ def test_the_demo_shows_everything_and_leaves_nothing_running(
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL])
-def test_an_interrupted_demo_leaves_nothing_running(
-    process: Callable[..., Any], eventually: Callable[..., None], mark: str, number: signal.Signals
-) -> None:
+def test_an_interrupted_demo_leaves_nothing_running(process, eventually, mark, number):
     demo = process("demo", "--output", "result", env={"SMP_MARK": mark})
     eventually(lambda: "exciting" in demo.output, 90.0, message=demo.output)
     assert len(alive(mark)) > 2 + len(WHEELS)
@@ -129,9 +124,7 @@ def test_an_interrupted_demo_leaves_nothing_running(
         assert "Traceback" not in demo.output
 
 
-def test_an_earlier_folder_of_another_kind_is_left_alone(
-    process: Callable[..., Any], tmp_path: Path
-) -> None:
+def test_an_earlier_folder_of_another_kind_is_left_alone(process, tmp_path):
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "thesis.tex").write_text("years of work")
     demo = process("demo", "--output", "mine")

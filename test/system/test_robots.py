@@ -34,9 +34,7 @@ def begin(process: Process, robot: str, sides: tuple[str, str], motors: Path, ga
     process("skid_steer", "--ros-args", *options)
 
 
-def test_two_robots_with_two_and_four_wheels_drive_independently(
-    process: Process, tmp_path: Path, ros_domain: int
-) -> None:
+def test_two_robots_with_two_and_four_wheels_drive_independently(process, tmp_path, ros_domain):
     begin(process, "robot1", ("left", "right"), *two_wheeled(tmp_path))
     lefts, rights = " ".join(WHEELS[::2]), " ".join(WHEELS[1::2])
     config = ROOT / "config"

@@ -3,8 +3,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 from independent import simulate
@@ -35,7 +33,7 @@ def arrivals(kind: str, n: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
 
 @pytest.mark.parametrize("kind", ["exponential", "bursts", "coarse"])
 @pytest.mark.parametrize("seed", [1, 2, 3])
-def test_the_lower_envelope_of_the_arrivals_is_the_beat(kind: str, seed: int) -> None:
+def test_the_lower_envelope_of_the_arrivals_is_the_beat(kind, seed):
     late, true = arrivals(kind, 4000, seed)
     beat = find_beat(late)
     assert beat is not None
@@ -45,7 +43,7 @@ def test_the_lower_envelope_of_the_arrivals_is_the_beat(kind: str, seed: int) ->
     assert beat.period == pytest.approx(1.0003 * T, rel=1e-4)
 
 
-def test_few_lost_samples_leave_the_beat_where_it_is() -> None:
+def test_few_lost_samples_leave_the_beat_where_it_is():
     rng = np.random.default_rng(4)
     true = T * np.arange(4000)
     late = np.maximum.accumulate(true + rng.exponential(0.3 * T, true.size))
@@ -57,18 +55,18 @@ def test_few_lost_samples_leave_the_beat_where_it_is() -> None:
     assert np.std(beat.time - true[kept]) < np.std(late[kept] - true[kept])
 
 
-def test_intervals_that_are_random_by_themselves_have_no_beat() -> None:
+def test_intervals_that_are_random_by_themselves_have_no_beat():
     rng = np.random.default_rng(5)
     time = np.cumsum(rng.uniform(0.3 * T, 1.7 * T, 4000)).astype(np.int64)
     assert find_beat(time) is None
 
 
-def test_a_regular_time_is_left_as_it_is() -> None:
+def test_a_regular_time_is_left_as_it_is():
     assert find_beat(arrivals("none", 1000, 1)[0]) is None
 
 
 @pytest.mark.parametrize("kind", ["exponential", "coarse"])
-def test_a_log_of_arrival_times_is_read_on_the_beat(tmp_path: Path, kind: str) -> None:
+def test_a_log_of_arrival_times_is_read_on_the_beat(tmp_path, kind):
     late, true = arrivals(kind, 2000, 6)
     motion = np.sin(2 * np.pi * true * 1e-9)  # 1 Hz, smooth on its true instants
     rows = [f"{t * 1e-9:.6f},{k % 7},{y:.9f}" for k, (t, y) in enumerate(zip(late, motion))]
@@ -79,7 +77,7 @@ def test_a_log_of_arrival_times_is_read_on_the_beat(tmp_path: Path, kind: str) -
     assert np.ptp(record.time - true * 1e-9) < 0.05e-9 * T
 
 
-def test_honest_stamps_with_jitter_are_kept(tmp_path: Path) -> None:
+def test_honest_stamps_with_jitter_are_kept(tmp_path):
     rng = np.random.default_rng(7)
     time = T * np.arange(2000) + rng.uniform(0, 0.8 * T, 2000)
     motion = np.sin(2 * np.pi * time * 1e-9)  # measured when the stamp says so
@@ -107,7 +105,7 @@ def _late_motor(kind: str, seed: int) -> tuple[Record, float]:
 
 
 @pytest.mark.parametrize("kind", ["exponential", "bursts"])
-def test_a_record_with_arrival_stamps_is_estimated_on_the_beat(kind: str) -> None:
+def test_a_record_with_arrival_stamps_is_estimated_on_the_beat(kind):
     record, electric = _late_motor(kind, 8)
     found = estimate(record)
     assert "arrival_beat" in [finding.code for finding in found.findings]
@@ -117,7 +115,7 @@ def test_a_record_with_arrival_stamps_is_estimated_on_the_beat(kind: str) -> Non
     assert ratio == pytest.approx(electric, rel=0.1)
 
 
-def test_a_record_with_stamps_of_its_own_keeps_them() -> None:
+def test_a_record_with_stamps_of_its_own_keeps_them():
     rng = np.random.default_rng(9)
     time = np.sort(1e-2 * np.arange(2000) + rng.uniform(0, 0.8e-2, 2000))
     record = Record("m", time, np.sin(time), velocity=np.sin(2 * np.pi * time))
@@ -125,9 +123,7 @@ def test_a_record_with_stamps_of_its_own_keeps_them() -> None:
 
 
 @pytest.mark.parametrize("rounding", [np.floor, np.rint])
-def test_a_regular_time_that_was_only_rounded_is_put_back_whatever_the_motion_shows(
-    rounding,
-) -> None:
+def test_a_regular_time_that_was_only_rounded_is_put_back_whatever_the_motion_shows(rounding):
     rng = np.random.default_rng(12)
     period, multiple = 2.3e-3, 1e-3  # a loop by a clock of milliseconds
     at = period * np.arange(3000)
@@ -157,13 +153,13 @@ def _stalled(seed: int, sampled_late: bool) -> Record:
 
 
 @pytest.mark.parametrize("seed", range(8))
-def test_samples_that_a_stall_made_late_keep_their_stamps_and_late_stamps_do_not(seed: int) -> None:
+def test_samples_that_a_stall_made_late_keep_their_stamps_and_late_stamps_do_not(seed):
     honest, arrived = _stalled(seed, True), _stalled(seed, False)
     assert on_beat(honest) is honest
     assert "arrival_beat" in [finding.code for finding in on_beat(arrived).findings]
 
 
-def test_how_sure_the_beat_is_of_its_period_is_how_it_scatters() -> None:
+def test_how_sure_the_beat_is_of_its_period_is_how_it_scatters():
     found = []
     for seed in range(40):
         rng = np.random.default_rng(seed)
@@ -177,9 +173,7 @@ def test_how_sure_the_beat_is_of_its_period_is_how_it_scatters() -> None:
 
 
 @pytest.mark.parametrize("held", [1, 40])
-def test_a_held_command_that_comes_in_bunches_is_put_back_on_its_beat(
-    tmp_path: Path, held: int
-) -> None:
+def test_a_held_command_that_comes_in_bunches_is_put_back_on_its_beat(tmp_path, held):
     n = 900
     volts = np.repeat(np.random.default_rng(2).uniform(-6, 6, n // held + 1), held)[:n]
     at = START + 30_000_000 * (np.arange(n) // 3 + 1)

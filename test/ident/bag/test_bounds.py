@@ -26,7 +26,7 @@ FUZZ = load("fuzz")
 
 
 @pytest.mark.parametrize("name", list(FUZZ.SEEDS))
-def test_a_sound_file_of_every_format_is_an_answer(tmp_path: Path, name: str) -> None:
+def test_a_sound_file_of_every_format_is_an_answer(tmp_path, name):
     FUZZ.SOUND.update({key: FUZZ.SEEDS[key][1]() for key in {name, "mcap", "sqlite"}})
     assert FUZZ.outcome(name, FUZZ.SOUND[name], tmp_path) == "answer"
 
@@ -40,27 +40,25 @@ def test_a_sound_file_of_every_format_is_an_answer(tmp_path: Path, name: str) ->
     suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow],
 )
 @given(seed=st.integers(0, 2**32))
-def test_a_spoilt_file_gives_an_answer_or_one_line(tmp_path: Path, name: str, seed: int) -> None:
+def test_a_spoilt_file_gives_an_answer_or_one_line(tmp_path, name, seed):
     if name not in FUZZ.SOUND:
         FUZZ.SOUND.update({key: FUZZ.SEEDS[key][1]() for key in {name, "mcap", "sqlite"}})
     spoilt = FUZZ.spoil(FUZZ.SOUND[name], random.Random(seed))
     assert FUZZ.outcome(name, spoilt, tmp_path) in ("answer", "partial", "refused")
 
 
-def test_a_message_that_quotes_a_spoilt_name_is_one_line() -> None:
+def test_a_message_that_quotes_a_spoilt_name_is_one_line():
     assert str(BagError("has /joint_sta\nes\x1b[2J")) == "has /joint_sta\ufffdes\ufffd[2J"
 
 
-def test_a_message_that_quotes_a_spoilt_value_keeps_head_and_tail() -> None:
+def test_a_message_that_quotes_a_spoilt_value_keeps_head_and_tail():
     long = BagError(f"a.yaml: left: {'- ' * 3000}is not SOURCE")
     assert len(str(long)) < 1100
     assert str(long).startswith("a.yaml: left: -") and str(long).endswith("- is not SOURCE")
     assert str(BagError("a.yaml: " + 900 * "x")) == "a.yaml: " + 900 * "x"
 
 
-def test_a_file_that_kills_the_matlab_reader_is_refused(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_file_that_kills_the_matlab_reader_is_refused(tmp_path, monkeypatch):
     path = tmp_path / "a.mat"
     path.write_bytes(FUZZ.SEEDS["mat"][1]())
     reader = tmp_path / "reader.py"
@@ -79,7 +77,7 @@ def bomb(kind: str, size: int) -> bytes:
 
 
 @pytest.mark.parametrize("kind", ["zstd", "lz4"])
-def test_a_bomb_is_refused_within_bounded_memory(tmp_path: Path, kind: str) -> None:
+def test_a_bomb_is_refused_within_bounded_memory(tmp_path, kind):
     path = tmp_path / f"bag.mcap.{kind}"
     path.write_bytes(bomb(kind, 400_000_000))
     code = (
@@ -103,9 +101,7 @@ def test_a_bomb_is_refused_within_bounded_memory(tmp_path: Path, kind: str) -> N
     assert int(kilobytes) < 100_000  # unpacked on disk, a piece at a time
 
 
-def test_the_limit_can_be_raised_and_lowered(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_limit_can_be_raised_and_lowered(tmp_path, monkeypatch):
     truth = motion()
     plain = write_mcap(tmp_path / "plain.mcap", truth.messages())
     path = tmp_path / "bag.mcap.zstd"
@@ -120,7 +116,7 @@ def test_the_limit_can_be_raised_and_lowered(
         read_records(path)
 
 
-def test_an_lz4_frame_that_lies_about_its_size_takes_no_memory(tmp_path: Path) -> None:
+def test_an_lz4_frame_that_lies_about_its_size_takes_no_memory(tmp_path):
     frame = bytearray(lz4.frame.compress(b"\x89MCAP0\r\n" + bytes(1000), store_size=True))
     frame[6:14] = (4_400_000_000).to_bytes(8, "little")  # the checksum of the head fails, too
     path = tmp_path / "bag.mcap.lz4"
@@ -131,9 +127,7 @@ def test_an_lz4_frame_that_lies_about_its_size_takes_no_memory(tmp_path: Path) -
     assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 100_000  # kB
 
 
-def test_the_second_frame_of_a_compressed_chunk_is_read(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_second_frame_of_a_compressed_chunk_is_read(tmp_path, monkeypatch):
     import mcap.writer
 
     once = zstd.compress

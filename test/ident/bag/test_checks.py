@@ -38,7 +38,7 @@ def codes(record: object) -> list[str]:
     return [finding.code for finding in record.findings]  # type: ignore[attr-defined]
 
 
-def test_values_that_jump_impossibly_are_left_out(tmp_path: Path) -> None:
+def test_values_that_jump_impossibly_are_left_out(tmp_path):
     speed = motion()
     speed[100], speed[200] = 1e200, speed[200] + 500  # spoilt exponent, spoilt mantissa
     path = write(tmp_path / "log.csv", t=T, u=U, y=speed)
@@ -49,7 +49,7 @@ def test_values_that_jump_impossibly_are_left_out(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("shape", ["pulses", "steps", "quantised", "rest"])
-def test_no_sample_of_a_real_motion_is_left_out(tmp_path: Path, shape: str) -> None:
+def test_no_sample_of_a_real_motion_is_left_out(tmp_path, shape):
     voltage, speed = U.copy(), motion()
     if shape == "pulses":
         voltage = np.where(np.arange(N) % 50 == 0, 12.0, 0.0)
@@ -74,9 +74,7 @@ def read_count(path: Path, count: np.ndarray, bits: int = 0) -> Record:
 
 
 @pytest.mark.parametrize("spoilt", [-(1 << 62), 3 << 40, 3 << 20])
-def test_a_count_that_jumps_impossibly_is_left_out_with_its_sample(
-    tmp_path: Path, spoilt: int
-) -> None:
+def test_a_count_that_jumps_impossibly_is_left_out_with_its_sample(tmp_path, spoilt):
     count = COUNT.copy()
     count[150] += spoilt
     record = read_count(tmp_path / "log.csv", count)
@@ -85,7 +83,7 @@ def test_a_count_that_jumps_impossibly_is_left_out_with_its_sample(
     np.testing.assert_array_equal(record.count, np.delete(COUNT, 150))
 
 
-def test_a_counter_that_turns_to_and_fro_where_it_wraps_loses_no_sample(tmp_path: Path) -> None:
+def test_a_counter_that_turns_to_and_fro_where_it_wraps_loses_no_sample(tmp_path):
     to_and_fro = np.rint(30 * np.sin(0.4 * np.arange(N))).astype(np.int64)
     to_and_fro[: N // 2] = 1000  # most of its steps are zero
     record = read_count(tmp_path / "log.csv", to_and_fro % (1 << 16), 16)
@@ -95,7 +93,7 @@ def test_a_counter_that_turns_to_and_fro_where_it_wraps_loses_no_sample(tmp_path
 
 
 @pytest.mark.parametrize("kind", ["armature", "offset", "without sign", "supply"])
-def test_a_current_without_sign_is_left_out_and_the_speed_kept(tmp_path: Path, kind: str) -> None:
+def test_a_current_without_sign_is_left_out_and_the_speed_kept(tmp_path, kind):
     speed = motion()
     armature = (U - 0.045 * speed) / 2 + 0.05 * np.sign(speed) + RNG.normal(0, 0.01, N)
     current = {
@@ -113,7 +111,7 @@ def test_a_current_without_sign_is_left_out_and_the_speed_kept(tmp_path: Path, k
 
 
 @pytest.mark.parametrize("levels", [(0, 1), (-1, 1)])
-def test_the_sign_comes_from_a_direction_column(tmp_path: Path, levels: tuple[int, int]) -> None:
+def test_the_sign_comes_from_a_direction_column(tmp_path, levels):
     direction = np.where(U > 0, levels[1], levels[0])
     path = write(tmp_path / "log.csv", t=T, pwm=np.abs(U) / 12 * 255, dir=direction, y=motion())
     mapping = "voltage=pwm:pwm direction=dir velocity=y time=t supply_voltage=12"
@@ -124,7 +122,7 @@ def test_the_sign_comes_from_a_direction_column(tmp_path: Path, levels: tuple[in
 
 
 @pytest.mark.parametrize("codes_of", [("F", "R"), ("fwd", "rev"), ("forwards", "backwards")])
-def test_a_direction_may_be_written_in_words(tmp_path: Path, codes_of: tuple[str, str]) -> None:
+def test_a_direction_may_be_written_in_words(tmp_path, codes_of):
     ways = [codes_of[0] if u > 0 else codes_of[1] for u in U]
     rows = [f"{t},{abs(u)},{way},{y}" for t, u, way, y in zip(T, U, ways, motion())]
     (tmp_path / "log.csv").write_text("\n".join(["t,u,dir,y", *rows]))
@@ -133,7 +131,7 @@ def test_a_direction_may_be_written_in_words(tmp_path: Path, codes_of: tuple[str
 
 
 @pytest.mark.parametrize("still", [0, 1])  # a third code for standstill
-def test_codes_of_a_direction_that_are_no_signs_are_questioned(tmp_path: Path, still: int) -> None:
+def test_codes_of_a_direction_that_are_no_signs_are_questioned(tmp_path, still):
     volts = U * (np.arange(N) % 40 >= 20 * still)
     direction = np.select([volts > 0, volts < 0], [1, 2], 0)
     path = write(tmp_path / "log.csv", t=T, u=np.abs(volts), dir=direction, y=motion())
@@ -144,7 +142,7 @@ def test_codes_of_a_direction_that_are_no_signs_are_questioned(tmp_path: Path, s
     np.testing.assert_allclose(record.voltage[1:], volts[:-1], rtol=1e-12)
 
 
-def test_a_speed_of_the_rim_needs_the_wheels_radius(tmp_path: Path) -> None:
+def test_a_speed_of_the_rim_needs_the_wheels_radius(tmp_path):
     path = write(tmp_path / "log.csv", t=T, u=U, y=0.03 * motion())
     record = read_records(path, ["voltage=u velocity=y:m/s time=t wheel_radius=0.03"])["motor"]
     np.testing.assert_allclose(record.velocity, motion(), atol=1e-12)
@@ -180,7 +178,7 @@ def signed(folder: Path, direction: str) -> Path:
 
 
 @pytest.mark.parametrize("direction", ["own", "one"])
-def test_a_command_that_has_a_sign_needs_no_direction(tmp_path: Path, direction: str) -> None:
+def test_a_command_that_has_a_sign_needs_no_direction(tmp_path, direction):
     path = signed(tmp_path, direction)
     mapping = ["voltage=pwm:% supply_voltage=12 velocity=w time=t"]
     plain = read_records(path, mapping)["motor"]
@@ -200,9 +198,7 @@ def test_a_command_that_has_a_sign_needs_no_direction(tmp_path: Path, direction:
         ("/motor/pwm_cmd.data", None),
     ],
 )
-def test_a_speed_command_mapped_as_a_voltage_is_told(
-    tmp_path: Path, field: str, severity: str | None
-) -> None:
+def test_a_speed_command_mapped_as_a_voltage_is_told(tmp_path, field, severity):
     twist, vector = "geometry_msgs/msg/Twist", TYPES.types["geometry_msgs/msg/Vector3"]
     topic, values = field.split(".")[0], np.arange(200) // 20 % 3
     at = START + 10**7 * np.arange(200)

@@ -32,7 +32,7 @@ def shown(count: np.ndarray, bits: int) -> np.ndarray:
 
 @pytest.mark.parametrize("bits", [8, 10, 16, 31])
 @pytest.mark.parametrize("signed", [True, False])
-def test_a_known_width_is_undone_to_the_count(bits: int, signed: bool) -> None:
+def test_a_known_width_is_undone_to_the_count(bits, signed):
     most = min(2 ** (bits - 1) - 1, 10**6)
     true = turning(most=most, seed=bits)
     raw = shown(true, bits) if signed else true % 2**bits
@@ -42,7 +42,7 @@ def test_a_known_width_is_undone_to_the_count(bits: int, signed: bool) -> None:
 
 
 @pytest.mark.parametrize("bits", [8, 16])
-def test_the_longest_step_of_a_width_is_half_of_its_range_and_counts_backwards(bits: int) -> None:
+def test_the_longest_step_of_a_width_is_half_of_its_range_and_counts_backwards(bits):
     half = 2 ** (bits - 1)
     for step, expected in ((half - 1, half - 1), (-half, -half), (half, -half)):
         raw = shown(np.array([0, 0, step, step]), bits)
@@ -50,7 +50,7 @@ def test_the_longest_step_of_a_width_is_half_of_its_range_and_counts_backwards(b
 
 
 @pytest.mark.parametrize("bits", [8, 10, 11, 12, 13, 14, 15, 16, 17, 18, 20, 24, 32])
-def test_an_unknown_width_is_seen_from_the_jumps_and_told(bits: int) -> None:
+def test_an_unknown_width_is_seen_from_the_jumps_and_told(bits):
     most = 6 if bits < 10 else 15  # so that a wrap is far beyond ten usual steps and 100
     true = turning(samples=4000, most=most, seed=bits)
     true += 2 ** (bits - 1) - true[2000]  # it wraps in the middle
@@ -62,7 +62,7 @@ def test_an_unknown_width_is_seen_from_the_jumps_and_told(bits: int) -> None:
     assert (finding.code, finding.evidence) == ("counter_wraps", {"bits": bits})
 
 
-def test_a_width_of_zero_and_a_counter_that_never_jumps_stay_as_they_are() -> None:
+def test_a_width_of_zero_and_a_counter_that_never_jumps_stay_as_they_are():
     true = turning()
     for bits in (0, None):
         found = unwrap(true, bits)
@@ -73,13 +73,13 @@ def test_a_width_of_zero_and_a_counter_that_never_jumps_stay_as_they_are() -> No
 
 
 @pytest.mark.parametrize("raw", [[], [7]])
-def test_a_counter_of_one_sample_is_unchanged(raw: list[int]) -> None:
+def test_a_counter_of_one_sample_is_unchanged(raw):
     found = unwrap(np.array(raw, np.int64), 16)
     assert found.count.tolist() == raw and found.resets.size == 0
     assert unwrap(np.array([5, 260]), 8).count.tolist() == [5, 4]
 
 
-def test_a_measured_speed_resolves_multiple_wraps_of_a_narrow_counter() -> None:
+def test_a_measured_speed_resolves_multiple_wraps_of_a_narrow_counter():
     steps = np.random.default_rng(1).integers(300, 500, 200)  # more than a turn of eight bits
     true = np.concatenate([[0], np.cumsum(steps)])
     expected = steps + np.random.default_rng(2).uniform(-100.0, 100.0, steps.size)
@@ -91,7 +91,7 @@ def test_a_measured_speed_resolves_multiple_wraps_of_a_narrow_counter() -> None:
 
 
 @pytest.mark.parametrize("measured", [True, False])
-def test_a_reset_adds_no_motion_and_keeps_the_counts_around_it(measured: bool) -> None:
+def test_a_reset_adds_no_motion_and_keeps_the_counts_around_it(measured):
     true = turning(samples=400, most=20) + 50_000
     raw = true.copy()
     raw[120:] -= true[120]  # starts at zero again
@@ -128,7 +128,7 @@ def fallen(at: int) -> np.ndarray:
         pytest.param(np.arange(1000, -1000, -5), np.full(399, -5.0), id="a measured way back"),
     ],
 )
-def test_wrong_samples_and_a_way_back_to_zero_are_no_resets(raw, measured) -> None:
+def test_wrong_samples_and_a_way_back_to_zero_are_no_resets(raw, measured):
     found = unwrap(raw, 0, measured)
     assert found.resets.size == 0 and np.array_equal(found.count, raw)
 
@@ -137,15 +137,15 @@ def test_wrong_samples_and_a_way_back_to_zero_are_no_resets(raw, measured) -> No
     ("length", "blocks", "found_at"), [(40, 4, 3), (40, 5, 0), (100, 11, 10), (80, 10, 0)]
 )
 def test_three_resets_or_a_hundredth_of_a_long_record_count_and_more_do_not(
-    length: int, blocks: int, found_at: int
-) -> None:
+    length, blocks, found_at
+):
     raw = np.tile(np.arange(0, 1000 * length, 1000), blocks)
     found = unwrap(raw, 0, np.full(raw.size - 1, 1000.0))
     assert found.resets.size == found_at
     assert found_at or np.array_equal(found.count, raw)
 
 
-def test_an_angle_within_one_turn_is_unwrapped_and_any_other_left() -> None:
+def test_an_angle_within_one_turn_is_unwrapped_and_any_other_left():
     true = 0.05 * turning(samples=500, most=9)
     wrap_angle = np.angle(np.exp(1j * true))
     gaps = wrap_angle.copy()
@@ -164,7 +164,7 @@ def test_an_angle_within_one_turn_is_unwrapped_and_any_other_left() -> None:
 
 
 @pytest.mark.parametrize("measured", [True, False])
-def test_a_counter_is_unwrapped_at_the_width_found_in_its_data(measured: bool) -> None:
+def test_a_counter_is_unwrapped_at_the_width_found_in_its_data(measured):
     true = turning(samples=600, most=90, seed=8) + 30_000  # it wraps before the first reset
     true[250:] -= true[250] - 5
     true[450:] += 15_000 - true[450]
@@ -181,7 +181,7 @@ def test_a_counter_is_unwrapped_at_the_width_found_in_its_data(measured: bool) -
     assert found.count[after] == raw[after]
 
 
-def test_a_motor_at_speed_wraps_an_unknown_width_that_its_speed_tells() -> None:
+def test_a_motor_at_speed_wraps_an_unknown_width_that_its_speed_tells():
     steps = np.random.default_rng(6).integers(55, 66, 3000)
     true = np.concatenate([[0], np.cumsum(steps)])
     raw = shown(true, 11)
@@ -189,7 +189,7 @@ def test_a_motor_at_speed_wraps_an_unknown_width_that_its_speed_tells() -> None:
     assert np.array_equal(found.count, true) and found.findings[0].evidence == {"bits": 11}
 
 
-def test_without_a_speed_a_reset_falls_further_than_the_largest_steps() -> None:
+def test_without_a_speed_a_reset_falls_further_than_the_largest_steps():
     steps = np.full(400, 5)
     steps[::40] = 400  # a few large ones: the bound of usual steps is 150
     for height, found_at in ((1900, False), (2100, True)):
@@ -201,7 +201,7 @@ def test_without_a_speed_a_reset_falls_further_than_the_largest_steps() -> None:
         assert unwrap(raw, 0, measured).resets.tolist() == [222]
 
 
-def test_a_narrow_counter_that_turns_as_fast_as_may_be_told_is_told() -> None:
+def test_a_narrow_counter_that_turns_as_fast_as_may_be_told_is_told():
     # Ten usual steps of 13 and 100 are 230; around the wrap it moves by 256 less 14 at the least.
     true = turning(samples=4000, most=14, seed=5)
     raw = shown(true, 8)
@@ -211,7 +211,7 @@ def test_a_narrow_counter_that_turns_as_fast_as_may_be_told_is_told() -> None:
 
 
 @pytest.mark.parametrize("measured", [True, False])
-def test_a_jump_of_no_counter_width_is_kept(measured: bool) -> None:
+def test_a_jump_of_no_counter_width_is_kept(measured):
     raw = turning(samples=300, most=20) + 50_000
     expected = np.diff(raw).astype(float) if measured else None
     raw[150:] += 5000
@@ -221,7 +221,7 @@ def test_a_jump_of_no_counter_width_is_kept(measured: bool) -> None:
     assert found.resets.size == 0 and found.findings == []
 
 
-def test_an_angle_that_leaves_one_turn_was_never_wrapped() -> None:
+def test_an_angle_that_leaves_one_turn_was_never_wrapped():
     for beyond, undone in ((0.0, True), (0.003, True), (0.2, False)):
         edge = np.pi + beyond
         raw = np.array([edge - 0.1, edge, -edge, -edge + 0.1])
@@ -236,7 +236,7 @@ def test_an_angle_that_leaves_one_turn_was_never_wrapped() -> None:
     seed=st.integers(0, 2**32 - 1),
     known=st.booleans(),
 )
-def test_a_counter_that_wraps_at_any_width_is_unwrapped(bits: int, seed: int, known: bool) -> None:
+def test_a_counter_that_wraps_at_any_width_is_unwrapped(bits, seed, known):
     rng = np.random.default_rng(seed)
     # A motor's counts change smoothly, by at most a sixteenth of the range from sample to sample.
     speed = np.sin(np.arange(400) / rng.uniform(20, 60)) * 2.0 ** min(bits - 4, 40)
@@ -264,15 +264,13 @@ def read_counts(path: Path, count: np.ndarray, a_sample: int, bits: int = 0) -> 
 @pytest.mark.parametrize(
     ("bits", "step"), [(16, 2**13), (32, 2**29), pytest.param(8, 700, id="2.7 ranges a sample")]
 )
-def test_a_wrapping_counter_in_a_bag_follows_its_description_and_its_speed(
-    tmp_path: Path, bits: int, step: int
-) -> None:
+def test_a_wrapping_counter_in_a_bag_follows_its_description_and_its_speed(tmp_path, bits, step):
     record = read_counts(tmp_path, np.arange(400, dtype=np.int64) * step - 3 * step, step, bits)
     np.testing.assert_array_equal(np.diff(record.count), step)
     assert record.starts == (0,)
 
 
-def test_a_reset_counter_begins_a_new_segment(tmp_path: Path) -> None:
+def test_a_reset_counter_begins_a_new_segment(tmp_path):
     count = np.arange(300, dtype=np.int64) * 50 + 20_000
     count[120:] -= count[120]
     record = read_counts(tmp_path, count, 50)
@@ -292,14 +290,14 @@ def with_inertia(samples: int, most: float, seed: int) -> np.ndarray:
 
 
 @pytest.mark.parametrize("width", [360, 400, 1000, 1440, 2400, 3000])
-def test_a_counter_that_starts_again_each_turn_is_undone(width: int) -> None:
+def test_a_counter_that_starts_again_each_turn_is_undone(width):
     true = np.rint(with_inertia(4000, width / 15, seed=width)).astype(np.int64)
     found = unwrap(true % width, None)
     assert np.array_equal(found.count - found.count[0], true - true[0])
     assert found.findings[0].evidence == {"counts": width}
 
 
-def test_a_width_that_is_not_known_well_enough_is_refused() -> None:
+def test_a_width_that_is_not_known_well_enough_is_refused():
     # Steps of a seventh of the width that scatter by a third of that: eight wraps tell it to 1 %.
     steps = np.random.default_rng(5).integers(100, 200, 60)
     with pytest.raises(BagError, match=r"starts again \d times, at about .* record faster"):
@@ -307,14 +305,14 @@ def test_a_width_that_is_not_known_well_enough_is_refused() -> None:
 
 
 @pytest.mark.parametrize("turns", [0.5, 1.0, 2.0, 3.0])
-def test_an_angle_that_wraps_at_turns_or_a_part_of_one_is_unwrapped(turns: float) -> None:
+def test_an_angle_that_wraps_at_turns_or_a_part_of_one_is_unwrapped(turns):
     true = with_inertia(2000, 0.5 * turns, seed=4)
     result, width = unwrap_angle(true % (2 * np.pi * turns) - 1.0)
     assert width == pytest.approx(2 * np.pi * turns, rel=1e-12)
     assert result - result[0] == pytest.approx(true - true[0], abs=1e-8)
 
 
-def test_an_angle_that_toggles_is_not_unwrapped() -> None:
+def test_an_angle_that_toggles_is_not_unwrapped():
     # A position loop that reaches its target in a sample, overshoots and settles.
     cycle = np.concatenate([np.zeros(20), [8.0, 7.3, 7.1], np.full(17, 7.0)])
     angle = np.tile(cycle, 10) + np.random.default_rng(7).normal(0, 0.01, 400)
@@ -323,7 +321,7 @@ def test_an_angle_that_toggles_is_not_unwrapped() -> None:
 
 
 @pytest.mark.parametrize("last", [65535, 255, 32767, -32768])
-def test_a_counter_that_stays_at_the_end_of_its_width_is_full(last: int) -> None:
+def test_a_counter_that_stays_at_the_end_of_its_width_is_full(last):
     true = (np.arange(400) * last) // 300
     clipped = np.minimum(true, last) if last > 0 else np.maximum(true, last)
     assert is_full(clipped) == last
@@ -331,7 +329,7 @@ def test_a_counter_that_stays_at_the_end_of_its_width_is_full(last: int) -> None
     assert is_full(clipped - 3) == 0, "no width ends there"
 
 
-def test_an_angle_that_begins_anew_at_each_run_of_a_joined_log_begins_a_segment(tmp_path) -> None:
+def test_an_angle_that_begins_anew_at_each_run_of_a_joined_log_begins_a_segment(tmp_path):
     voltage = np.repeat([3.0, 6.0, 0.0], 100)
     run = np.cumsum(voltage * 400.0) * 0.01  # degrees, from zero
     table = np.column_stack([0.01 * np.arange(900), np.tile(voltage, 3), np.tile(run, 3)])
@@ -344,7 +342,7 @@ def test_an_angle_that_begins_anew_at_each_run_of_a_joined_log_begins_a_segment(
 
 
 @pytest.mark.parametrize("offset", [2**53, 2**60, 2**62 + 12_345, -(2**63) + 10**6])
-def test_counts_far_from_zero_keep_every_step(tmp_path: Path, offset: int) -> None:
+def test_counts_far_from_zero_keep_every_step(tmp_path, offset):
     true = turning()
     rows = (f"{0.01 * k:.2f},{k % 5},{n + offset}" for k, n in enumerate(true.tolist()))
     (tmp_path / "log.csv").write_text("\n".join(["t,u,c", *rows]))
@@ -353,14 +351,14 @@ def test_counts_far_from_zero_keep_every_step(tmp_path: Path, offset: int) -> No
     assert np.array_equal(record.count - record.count[0], true - true[0])
 
 
-def test_counts_that_no_encoder_makes_are_refused(tmp_path: Path) -> None:
+def test_counts_that_no_encoder_makes_are_refused(tmp_path):
     rows = (f"{0.01 * k:.2f},8,{k**2 * 10**14}" for k in range(300))
     (tmp_path / "log.csv").write_text("\n".join(["t,u,c", *rows]))
     with pytest.raises(BagError, match="the count moves by"):
         read_records(tmp_path / "log.csv", ["voltage=u count=c time=t counts_per_revolution=2000"])
 
 
-def test_the_roundest_width_is_found_at_once_however_many_are_admitted() -> None:
+def test_the_roundest_width_is_found_at_once_however_many_are_admitted():
     assert round_to_counts(Wrap(3.1e17, 1e16, 5), 10**9) == 2**58
     assert round_to_counts(Wrap(2.0e17 - 100, 1e14, 5), 10**9) % 1000 == 0
     assert round_to_counts(Wrap(1999.8, 0.1, 5), 1990) == 2000
@@ -379,7 +377,7 @@ def folded(top: float, lag: float, drive: str) -> np.ndarray:
 
 @pytest.mark.parametrize("drive", ["levels", "sine", "step"])
 @pytest.mark.parametrize("lag", [4.0, 15.0])
-def test_more_than_half_a_turn_a_sample_is_refused_as_aliasing(drive: str, lag: float) -> None:
+def test_more_than_half_a_turn_a_sample_is_refused_as_aliasing(drive, lag):
     angle, width = unwrap_angle(folded(0.9, lag, drive))
     assert width == 2 * np.pi and np.abs(np.diff(angle)).max() < np.pi
     with pytest.raises(BagError, match=r"turns by more than half of its 6\.283 from"):
@@ -387,13 +385,13 @@ def test_more_than_half_a_turn_a_sample_is_refused_as_aliasing(drive: str, lag: 
 
 
 @pytest.mark.parametrize("faults", [1, 2])
-def test_single_faults_of_a_fast_angle_are_not_aliasing(faults: int) -> None:
+def test_single_faults_of_a_fast_angle_are_not_aliasing(faults):
     angle = folded(0.9, 15.0, "levels")
     angle[[500, 900][:faults]] += 3.0
     assert unwrap_angle(np.mod(angle, 2 * np.pi))[1] == 2 * np.pi
 
 
-def test_a_narrow_counter_that_turns_over_half_of_its_width_is_refused() -> None:
+def test_a_narrow_counter_that_turns_over_half_of_its_width_is_refused():
     counts = np.rint(folded(1.5, 15.0, "levels") / (2 * np.pi) * 256).astype(np.int64) % 256
     with pytest.raises(BagError, match="turns by more than half of its 256"):
         unwrap(counts, 8)

@@ -30,7 +30,7 @@ def table(
 
 
 @pytest.mark.parametrize("encoding", ["utf-8", "utf-16", "latin-1"])
-def test_text_of_old_and_wide_encodings_is_read(tmp_path: Path, encoding: str) -> None:
+def test_text_of_old_and_wide_encodings_is_read(tmp_path, encoding):
     path = tmp_path / "log.csv"
     path.write_bytes(table(head="t,u,y [°/s]").encode(encoding))
     record = read_records(path, ["voltage=u", 'velocity="y [°/s]":deg/s', "time=t"])["motor"]
@@ -55,7 +55,7 @@ def test_text_of_old_and_wide_encodings_is_read(tmp_path: Path, encoding: str) -
         re.sub(r"([^,\n]+)", r'"\1"', table()),
     ],
 )
-def test_every_usual_kind_of_csv_is_read(tmp_path: Path, text: str) -> None:
+def test_every_usual_kind_of_csv_is_read(tmp_path, text):
     path = tmp_path / "log.csv"
     path.write_bytes(text.encode())
     record = read_records(path, MAP)["motor"]
@@ -84,9 +84,7 @@ def test_every_usual_kind_of_csv_is_read(tmp_path: Path, text: str) -> None:
         ("# a,b,c\nt,u,y", ",", ["t", "u", "y"]),
     ],
 )
-def test_a_comment_right_above_the_numbers_may_name_the_columns(
-    tmp_path: Path, above: str, separator: str, names: list[str]
-) -> None:
+def test_a_comment_right_above_the_numbers_may_name_the_columns(tmp_path, above, separator, names):
     path = tmp_path / "log.csv"
     path.write_text(above + "\n" + table(separator).partition("\n")[2])
     listing = list_topics(path)[0]
@@ -111,9 +109,7 @@ def test_a_comment_right_above_the_numbers_may_name_the_columns(
         pytest.param("C.07A, y: 3", "t: {}s, u: {}V, y: {}deg/s", "", id="units behind numbers"),
     ],
 )
-def test_rows_as_programs_print_them_are_read(
-    tmp_path: Path, head: str, row: str, end: str
-) -> None:
+def test_rows_as_programs_print_them_are_read(tmp_path, head, row, end):
     rows = [row.format(*x) for x in zip(np.arange(5) * 0.02, U, Y)]
     rows[0] = "[" + rows[0] if row.endswith(";") else rows[0]
     rows = [text.replace(".", ",") if end else text for text in rows]
@@ -126,7 +122,7 @@ def test_rows_as_programs_print_them_are_read(
 
 
 @pytest.mark.parametrize("row", ["{},{}", "{} {}", "{}\t{}", "u:{},y:{}", "u={} y={}"])
-def test_rows_behind_a_serial_monitors_stamps_are_read(tmp_path: Path, row: str) -> None:
+def test_rows_behind_a_serial_monitors_stamps_are_read(tmp_path, row):
     rows = [f"12:00:0{k}.500 -> {row.format(u, y)}" for k, (u, y) in enumerate(zip(U, Y))]
     (tmp_path / "log.txt").write_text("\n".join(rows))
     names = ("time", "u", "y") if "u" in row else ("c1", "c2", "c3")
@@ -145,22 +141,20 @@ def test_rows_behind_a_serial_monitors_stamps_are_read(tmp_path: Path, row: str)
         ("Time Commanded Pos Encoder 1", ["c1", "c2", "c3"]),
     ],
 )
-def test_names_of_several_words_are_not_shifted(
-    tmp_path: Path, head: str, names: list[str]
-) -> None:
+def test_names_of_several_words_are_not_shifted(tmp_path, head, names):
     (tmp_path / "log.txt").write_text(head + "\n" + table(" ").partition("\n")[2])
     assert list_topics(tmp_path / "log.txt")[0].offers[0].fields == names
 
 
 @pytest.mark.parametrize("between", ["T", " ", "_", "."])
-def test_a_time_of_day_is_not_a_label(tmp_path: Path, between: str) -> None:
+def test_a_time_of_day_is_not_a_label(tmp_path, between):
     rows = [f"2024-05-06{between}12:00:0{k},{u},{y}" for k, (u, y) in enumerate(zip(U, Y))]
     (tmp_path / "log.csv").write_text("\n".join(["t,u,y", *rows]))
     record = read_records(tmp_path / "log.csv", MAP)["motor"]
     np.testing.assert_allclose(record.time, np.arange(5))
 
 
-def test_notes_below_a_short_table_are_no_part_of_it(tmp_path: Path) -> None:
+def test_notes_below_a_short_table_are_no_part_of_it(tmp_path):
     path = tmp_path / "log.csv"
     path.write_text(table(", ", head="t, u, y") + "Acceleration: 9.46\n")
     (record,) = read_records(path, MAP).values()
@@ -168,14 +162,14 @@ def test_notes_below_a_short_table_are_no_part_of_it(tmp_path: Path) -> None:
     assert "stray_rows" in [f.code for f in record.findings]
 
 
-def test_units_in_a_comment_below_the_names_are_understood(tmp_path: Path) -> None:
+def test_units_in_a_comment_below_the_names_are_understood(tmp_path):
     (tmp_path / "log.csv").write_text("# t,u,y\n# s,mV,deg/s\n" + table().partition("\n")[2])
     record = read_records(tmp_path / "log.csv", ["voltage=u velocity=y time=t"])["motor"]
     np.testing.assert_allclose(record.voltage[1:], 1e-3 * U[:-1])
     np.testing.assert_allclose(record.velocity, np.deg2rad(Y))
 
 
-def test_a_voltage_may_have_been_held_up_to_its_row(tmp_path: Path) -> None:
+def test_a_voltage_may_have_been_held_up_to_its_row(tmp_path):
     (tmp_path / "log.csv").write_text(table())
     record = read_records(tmp_path / "log.csv", [*MAP, "held=before"])["motor"]
     np.testing.assert_allclose(record.voltage, U)
@@ -183,9 +177,7 @@ def test_a_voltage_may_have_been_held_up_to_its_row(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("output", ["velocity", "position", "count"])
 @pytest.mark.parametrize("lead", [False, True])
-def test_the_motion_tells_whether_a_voltage_held_up_to_its_row(
-    tmp_path: Path, lead: bool, output: str
-) -> None:
+def test_the_motion_tells_whether_a_voltage_held_up_to_its_row(tmp_path, lead, output):
     rng = np.random.default_rng(1)
     volts = np.repeat(rng.uniform(-6, 6, 30), 20)
     speed = np.zeros(volts.size)
@@ -207,9 +199,7 @@ def test_the_motion_tells_whether_a_voltage_held_up_to_its_row(
 
 
 @pytest.mark.parametrize("noise", [0.3, 3.0])
-def test_a_loop_that_answers_its_own_rows_is_not_taken_for_its_motor(
-    tmp_path: Path, noise: float
-) -> None:
+def test_a_loop_that_answers_its_own_rows_is_not_taken_for_its_motor(tmp_path, noise):
     """A controller's command answers the row's speed at once; the speed does not answer it."""
     rng = np.random.default_rng(2)
     target = np.repeat(rng.uniform(-100, 100, 30), 20)
@@ -225,7 +215,7 @@ def test_a_loop_that_answers_its_own_rows_is_not_taken_for_its_motor(
     assert "held_before" not in [f.code for f in record.findings]
 
 
-def test_empty_cells_are_missing_values(tmp_path: Path) -> None:
+def test_empty_cells_are_missing_values(tmp_path):
     text = "t,u,y,i\n" + "".join(f"{k * 0.01},{k},{k if k % 10 else ''},nan\n" for k in range(100))
     (tmp_path / "log.csv").write_text(text)
     record = read_records(tmp_path / "log.csv", ["voltage=u velocity=y current=i time=t"])["motor"]
@@ -235,9 +225,7 @@ def test_empty_cells_are_missing_values(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("step", "unit"), [(20, "ms"), (5180, "us")])
-def test_a_time_without_unit_that_cannot_be_seconds_is_asked_for(
-    tmp_path: Path, step: int, unit: str
-) -> None:
+def test_a_time_without_unit_that_cannot_be_seconds_is_asked_for(tmp_path, step, unit):
     path = tmp_path / "log.csv"
     path.write_text("\n".join(["tiempo,u,y", *(f"{step * k},{k % 7},{k % 5}" for k in range(99))]))
     with pytest.raises(BagError, match=f"rises by {step} per row.* time=tiempo:ms"):
@@ -247,7 +235,7 @@ def test_a_time_without_unit_that_cannot_be_seconds_is_asked_for(
         np.testing.assert_allclose(np.diff(record.time), step * factor)
 
 
-def test_columns_of_words_are_not_in_the_way(tmp_path: Path) -> None:
+def test_columns_of_words_are_not_in_the_way(tmp_path):
     rng = np.random.default_rng(8)
     pairs = zip(np.repeat(rng.uniform(-6, 6, 20), 10), np.cumsum(rng.normal(0, 1, 200)))
     rows = [
@@ -262,18 +250,18 @@ def test_columns_of_words_are_not_in_the_way(tmp_path: Path) -> None:
         read_records(path, ["voltage=frame velocity=y time=t"])
 
 
-def test_quoted_cells_with_decimal_commas_are_no_quoted_rows(tmp_path: Path) -> None:
+def test_quoted_cells_with_decimal_commas_are_no_quoted_rows(tmp_path):
     (tmp_path / "u.csv").write_text('"u"\n' + "".join(f'"{x:g}"\n'.replace(".", ",") for x in U))
     assert list_topics(tmp_path / "u.csv")[0].offers[0].fields == ["u"]
 
 
-def test_a_file_without_time_has_a_sample_time(tmp_path: Path) -> None:
+def test_a_file_without_time_has_a_sample_time(tmp_path):
     (tmp_path / "log.csv").write_text(table())
     record = read_records(tmp_path / "log.csv", ["voltage=u velocity=y sample_time=0.5"])["motor"]
     np.testing.assert_allclose(record.time, np.arange(5) * 0.5)
 
 
-def test_a_time_with_an_offset_brings_two_tables_onto_one_clock(tmp_path: Path) -> None:
+def test_a_time_with_an_offset_brings_two_tables_onto_one_clock(tmp_path):
     time = np.arange(100) * 0.02
     voltage, late = np.where(time % 0.6 < 0.3, 3.0, -3.0), (0.0, 0.5)
     np.savetxt(tmp_path / "set.csv", np.stack([time, voltage], 1), header="t,u", delimiter=",")
@@ -286,7 +274,7 @@ def test_a_time_with_an_offset_brings_two_tables_onto_one_clock(tmp_path: Path) 
     np.testing.assert_array_equal(*(record.voltage for record in records))
 
 
-def test_several_files_are_several_experiments_of_several_motors(tmp_path: Path) -> None:
+def test_several_files_are_several_experiments_of_several_motors(tmp_path):
     for name in ("a.csv", "b.csv"):
         (tmp_path / name).write_text(table())
     mapping = ["time=t left.voltage=u left.velocity=y:deg/s right.voltage=y right.velocity=u"]
@@ -295,7 +283,7 @@ def test_several_files_are_several_experiments_of_several_motors(tmp_path: Path)
 
 
 @pytest.mark.parametrize("names", ["t_us,u_mV,y_rpm", "micros,u mV,rpm", "t [us],u [mV],y [rpm]"])
-def test_a_unit_in_a_columns_name_is_its_unit(tmp_path: Path, names: str) -> None:
+def test_a_unit_in_a_columns_name_is_its_unit(tmp_path, names):
     (tmp_path / "log.csv").write_text(table(head=names))
     t, u, y = (f'"{name}"' for name in names.split(","))
     record = read_records(tmp_path / "log.csv", [f"voltage={u} velocity={y} time={t}"])["motor"]
@@ -307,7 +295,7 @@ def test_a_unit_in_a_columns_name_is_its_unit(tmp_path: Path, names: str) -> Non
     np.testing.assert_allclose(plain["motor"].velocity, np.deg2rad(Y))
 
 
-def test_a_column_goes_by_its_name_without_the_unit(tmp_path: Path) -> None:
+def test_a_column_goes_by_its_name_without_the_unit(tmp_path):
     path = tmp_path / "log.csv"
     path.write_text(table(";", ",", "Zeit [ms],Spannung [V],Drehzahl [rpm]"))
     mapping = "voltage=Spannung velocity=Drehzahl time=Zeit"
@@ -333,9 +321,7 @@ def test_a_column_goes_by_its_name_without_the_unit(tmp_path: Path) -> None:
         ("\x00\xff\xfe", MAP, "log.csv"),
     ],
 )
-def test_unreadable_files_are_refused_with_name_and_reason(
-    tmp_path: Path, text: str, mapping: list[str] | None, reason: str
-) -> None:
+def test_unreadable_files_are_refused_with_name_and_reason(tmp_path, text, mapping, reason):
     path = tmp_path / "log.csv"
     path.write_bytes(text.encode("latin-1"))
     with pytest.raises(BagError) as refused:
@@ -348,7 +334,7 @@ def test_unreadable_files_are_refused_with_name_and_reason(
 @pytest.mark.skipif(
     not DATA.exists(), reason="needs the recordings of the repository's parent folder"
 )
-def test_the_recordings_of_real_motors_are_read() -> None:
+def test_the_recordings_of_real_motors_are_read():
     path = DATA / "prbs_gearmotor" / "prbs_2026-08-14.csv"
     record = read_records(path, MAP)["motor"]
     assert len(record) == 4093
@@ -371,7 +357,7 @@ def test_the_recordings_of_real_motors_are_read() -> None:
     assert records[0].velocity_window == 0.032
 
 
-def test_labels_of_several_words_have_their_units(tmp_path: Path) -> None:
+def test_labels_of_several_words_have_their_units(tmp_path):
     rows = [f"PWM percent: {u}%, Motor speed: {y} rpm" for u, y in zip(U, Y)]
     (tmp_path / "log.txt").write_text("\n".join(["connected", *rows]))
     offer = list_topics(tmp_path / "log.txt")[0].offers[0]
@@ -380,7 +366,7 @@ def test_labels_of_several_words_have_their_units(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("end", [";", " ;", ";\r"])
-def test_a_semicolon_at_the_end_of_every_row_ends_it(tmp_path: Path, end: str) -> None:
+def test_a_semicolon_at_the_end_of_every_row_ends_it(tmp_path, end):
     rows = [f"{20 * k}, {u}, {y}{end}" for k, (u, y) in enumerate(zip(U, Y))]
     (tmp_path / "log.csv").write_text("\n".join(rows))
     assert list_topics(tmp_path / "log.csv")[0].offers[0].fields == ["c1", "c2", "c3"]
@@ -389,7 +375,7 @@ def test_a_semicolon_at_the_end_of_every_row_ends_it(tmp_path: Path, end: str) -
     np.testing.assert_allclose(record.velocity, Y * np.pi / 180)
 
 
-def test_shares_are_read_as_they_are_written(tmp_path: Path) -> None:
+def test_shares_are_read_as_they_are_written(tmp_path):
     rows = [f"{0.02 * k},{u}%,{y}" for k, (u, y) in enumerate(zip(U, Y))]
     (tmp_path / "log.csv").write_text("\n".join(["t,u,y", *rows]))
     record = read_records(tmp_path / "log.csv", [*MAP, "supply_voltage=12"])["motor"]
@@ -400,14 +386,14 @@ def test_shares_are_read_as_they_are_written(tmp_path: Path) -> None:
     ("stamp", "reason"),
     [("2262-05-01T00:00:00.{:03}", "is not a number"), ("0", "all 5 rows have the same time, 0 s")],
 )
-def test_a_time_that_tells_nothing_is_named(tmp_path: Path, stamp: str, reason: str) -> None:
+def test_a_time_that_tells_nothing_is_named(tmp_path, stamp, reason):
     rows = [f"{stamp.format(20 * k)},{u},{y}" for k, (u, y) in enumerate(zip(U, Y))]
     (tmp_path / "log.csv").write_text("\n".join(["t,u,y", *rows]))
     with pytest.raises(BagError, match=reason):
         read_records(tmp_path / "log.csv", MAP)
 
 
-def test_elapsed_hours_and_days_are_times(tmp_path: Path) -> None:
+def test_elapsed_hours_and_days_are_times(tmp_path):
     rows = [f"{25 + k}:00:00.5,{u},{y}" for k, (u, y) in enumerate(zip(U, Y))]
     (tmp_path / "log.csv").write_text("\n".join(["t,u,y", *rows]))
     record = read_records(tmp_path / "log.csv", [*MAP, "gap=7200"])["motor"]
@@ -423,9 +409,7 @@ def columns(folder: Path, *names: str) -> list[Path]:
 
 
 @pytest.mark.parametrize("mapping", [MAP, ["voltage=/u.u velocity=/y.y:deg/s time=/t.t"]])
-def test_a_recording_of_one_column_a_file_is_put_together(
-    tmp_path: Path, mapping: list[str]
-) -> None:
+def test_a_recording_of_one_column_a_file_is_put_together(tmp_path, mapping):
     record = read_records(columns(tmp_path, "t", "u", "y"), mapping)["motor"]
     np.testing.assert_allclose(record.velocity, Y * np.pi / 180)
     np.testing.assert_allclose(record.time, 0.02 * np.arange(5))
@@ -436,7 +420,7 @@ def test_a_recording_of_one_column_a_file_is_put_together(
     np.testing.assert_allclose(record.time, 0.1 * np.arange(5))
 
 
-def test_times_of_another_number_of_rows_are_refused(tmp_path: Path) -> None:
+def test_times_of_another_number_of_rows_are_refused(tmp_path):
     files = columns(tmp_path, "t", "u", "y")
     files[0].write_text("t\n0\n1\n")
     with pytest.raises(BagError, match=r"has 5 rows, and their time /t\.t has 2"):
@@ -444,7 +428,7 @@ def test_times_of_another_number_of_rows_are_refused(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("column", ["u", "y"])
-def test_a_column_that_holds_no_number_is_named(tmp_path: Path, column: str) -> None:
+def test_a_column_that_holds_no_number_is_named(tmp_path, column):
     rows = [("nan" if column == "u" else u, "" if column == "y" else y) for u, y in zip(U, Y)]
     text = "\n".join(["t,u,y", *(f"{0.02 * k},{u},{y}" for k, (u, y) in enumerate(rows))])
     (tmp_path / "log.csv").write_text(text)

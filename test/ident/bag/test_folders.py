@@ -22,7 +22,7 @@ def bag(tmp_path: Path) -> Path:
 
 @pytest.mark.parametrize("storage", ["mcap", "db3"])
 @pytest.mark.parametrize("described", [True, False])
-def test_split_bags_are_one_recording(bag: Path, storage: str, described: bool) -> None:
+def test_split_bags_are_one_recording(bag, storage, described):
     truth = motion(n=300)
     messages = truth.messages()
     write = write_mcap if storage == "mcap" else write_sqlite
@@ -37,7 +37,7 @@ def test_split_bags_are_one_recording(bag: Path, storage: str, described: bool) 
     assert ("metadata.yaml" in notes(record)) is not described
 
 
-def test_a_missing_part_of_a_split_bag_is_told_with_its_messages(bag: Path) -> None:
+def test_a_missing_part_of_a_split_bag_is_told_with_its_messages(bag):
     truth = motion(n=300)
     messages = truth.messages()
     write_mcap(bag / "bag_0.mcap", messages[:101])
@@ -48,7 +48,7 @@ def test_a_missing_part_of_a_split_bag_is_told_with_its_messages(bag: Path) -> N
     assert "100 of 300 messages" in notes(record)
 
 
-def test_a_damaged_part_of_a_split_bag_costs_only_itself(bag: Path) -> None:
+def test_a_damaged_part_of_a_split_bag_costs_only_itself(bag):
     truth = motion(n=300)
     messages = truth.messages()
     write_mcap(bag / "bag_0.mcap", messages[:101])
@@ -62,7 +62,7 @@ def test_a_damaged_part_of_a_split_bag_costs_only_itself(bag: Path) -> None:
     assert "200 of 300 messages" in notes(record)
 
 
-def test_a_folder_of_bags_is_a_list_of_experiments(tmp_path: Path) -> None:
+def test_a_folder_of_bags_is_a_list_of_experiments(tmp_path):
     truths = [motion(n=50 + k, seed=k) for k in range(3)]
     for k, truth in enumerate(truths):
         bag = tmp_path / f"run{k}"
@@ -77,7 +77,7 @@ def test_a_folder_of_bags_is_a_list_of_experiments(tmp_path: Path) -> None:
     assert joined.source == "run0, run1, run2"
 
 
-def test_bare_files_of_different_names_in_a_folder_are_experiments(tmp_path: Path) -> None:
+def test_bare_files_of_different_names_in_a_folder_are_experiments(tmp_path):
     for name in ("slow.mcap", "fast.mcap"):
         write_mcap(tmp_path / name, motion(n=20).messages())
     assert [r.source for r in read_experiments(tmp_path)["front_left"]] == [
@@ -86,7 +86,7 @@ def test_bare_files_of_different_names_in_a_folder_are_experiments(tmp_path: Pat
     ]
 
 
-def test_fewer_messages_than_the_metadata_count_are_named(tmp_path: Path) -> None:
+def test_fewer_messages_than_the_metadata_count_are_named(tmp_path):
     truth = motion()
     bag = tmp_path / "bag"
     bag.mkdir()
@@ -101,14 +101,14 @@ def test_fewer_messages_than_the_metadata_count_are_named(tmp_path: Path) -> Non
     assert "200 of 1234 messages could be read" in notes(read_records(bag)["front_left"])
 
 
-def test_a_path_that_does_not_exist_and_an_empty_folder_are_refused(tmp_path: Path) -> None:
+def test_a_path_that_does_not_exist_and_an_empty_folder_are_refused(tmp_path):
     with pytest.raises(BagError, match="does not exist"):
         read_records(tmp_path / "nothing")
     with pytest.raises(BagError, match="holds no bag"):
         read_records(tmp_path)
 
 
-def test_a_folder_of_bags_tells_which_of_them_could_not_be_read(tmp_path: Path) -> None:
+def test_a_folder_of_bags_tells_which_of_them_could_not_be_read(tmp_path):
     for name in ("good", "bad"):
         (tmp_path / name).mkdir()
         write_mcap(tmp_path / name / "x_0.mcap", motion(n=20).messages())
@@ -122,7 +122,7 @@ def test_a_folder_of_bags_tells_which_of_them_could_not_be_read(tmp_path: Path) 
 
 
 @pytest.mark.parametrize("text", ["", ":\n - {", "a: 1", "rosbag2_bagfile_information: 7"])
-def test_damaged_metadata_do_not_hide_the_files(tmp_path: Path, text: str) -> None:
+def test_damaged_metadata_do_not_hide_the_files(tmp_path, text):
     truth = motion()
     write_mcap(tmp_path / "x_0.mcap", truth.messages())
     (tmp_path / "metadata.yaml").write_text(text)

@@ -9,7 +9,6 @@ import sqlite3
 import struct
 import warnings
 from collections.abc import Callable
-from pathlib import Path
 
 import lz4.frame
 import mcap.writer
@@ -44,7 +43,7 @@ PACKERS: dict[str, Pack] = {
 
 @pytest.mark.parametrize("pack", PACKERS)
 @pytest.mark.parametrize("storage", ["mcap", "db3"])
-def test_messages_compressed_one_by_one_are_read(tmp_path: Path, storage: str, pack: str) -> None:
+def test_messages_compressed_one_by_one_are_read(tmp_path, storage, pack):
     truth = motion()
     write = write_mcap if storage == "mcap" else write_sqlite
     path = write(tmp_path / f"bag.{storage}", truth.messages(), encode=PACKERS[pack])
@@ -55,9 +54,7 @@ def test_messages_compressed_one_by_one_are_read(tmp_path: Path, storage: str, p
 @pytest.mark.parametrize("pack", PACKERS)
 @pytest.mark.parametrize("storage", ["mcap", "db3"])
 @pytest.mark.parametrize("bare", [True, False])
-def test_files_compressed_as_a_whole_are_read(
-    tmp_path: Path, storage: str, pack: str, bare: bool
-) -> None:
+def test_files_compressed_as_a_whole_are_read(tmp_path, storage, pack, bare):
     truth = motion()
     bag = tmp_path / "bag"
     bag.mkdir()
@@ -83,12 +80,7 @@ def test_files_compressed_as_a_whole_are_read(
 @pytest.mark.parametrize("compression", mcap.writer.CompressionType)
 @pytest.mark.parametrize("chunked", [True, False])
 @pytest.mark.parametrize("indexed", [True, False])
-def test_chunks_of_every_compression_are_read(
-    tmp_path: Path,
-    compression: mcap.writer.CompressionType,
-    chunked: bool,
-    indexed: bool,
-) -> None:
+def test_chunks_of_every_compression_are_read(tmp_path, compression, chunked, indexed):
     truth, other = motion(seed=2), motion(wheel="rear_left", seed=3)
     path = write_mcap(
         tmp_path / "bag.mcap",
@@ -107,9 +99,7 @@ def test_chunks_of_every_compression_are_read(
 
 @pytest.mark.parametrize("version", range(1, 10))
 @pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
-def test_metadata_of_every_version_are_understood(
-    tmp_path: Path, version: int, storage: str
-) -> None:
+def test_metadata_of_every_version_are_understood(tmp_path, version, storage):
     truth = motion()
     bag = tmp_path / "bag"
     bag.mkdir()
@@ -125,12 +115,7 @@ def test_metadata_of_every_version_are_understood(
 @pytest.mark.parametrize("plugin", StoragePlugin)
 @pytest.mark.parametrize("mode", CompressionMode)
 @pytest.mark.parametrize("version", [8, 9])
-def test_bags_of_rosbags_are_read(
-    tmp_path: Path,
-    plugin: StoragePlugin,
-    mode: CompressionMode,
-    version: int,
-) -> None:
+def test_bags_of_rosbags_are_read(tmp_path, plugin, mode, version):
     if plugin == StoragePlugin.SQLITE3 and mode == CompressionMode.STORAGE:
         pytest.skip("SQLite has no compression of its own")
     truth = motion()
@@ -147,7 +132,7 @@ def test_bags_of_rosbags_are_read(
     assert_read(read_records(tmp_path / "bag")["front_left"], truth)
 
 
-def test_qos_that_disagrees_between_metadata_and_file_hides_nothing(tmp_path: Path) -> None:
+def test_qos_that_disagrees_between_metadata_and_file_hides_nothing(tmp_path):
     truth = motion()
     tmp_path.joinpath("bag").mkdir()
     bag = tmp_path / "bag"
@@ -158,7 +143,7 @@ def test_qos_that_disagrees_between_metadata_and_file_hides_nothing(tmp_path: Pa
     assert_read(read_records(bag)["front_left"], truth)
 
 
-def test_messages_that_only_the_journal_holds_are_read(tmp_path: Path) -> None:
+def test_messages_that_only_the_journal_holds_are_read(tmp_path):
     truth = motion()
     messages = truth.messages()
     path = write_sqlite(tmp_path / "bag.db3", messages[:101])
@@ -188,9 +173,7 @@ def test_messages_that_only_the_journal_holds_are_read(tmp_path: Path) -> None:
     assert (dead / "bag.db3").read_bytes() == before
 
 
-def test_a_message_that_changed_between_distributions_is_read_by_the_fitting_definition(
-    tmp_path: Path,
-) -> None:
+def test_a_message_that_changed_between_distributions_is_read_by_the_fitting_definition(tmp_path):
     # Range of Foxy has no field `variance`; the bag does not define it.
     whole = serialized(
         "sensor_msgs/msg/Range",
@@ -226,9 +209,7 @@ def test_a_message_that_changed_between_distributions_is_read_by_the_fitting_def
         ("a.db3", b"SQLite format 3\0" + bytes(4080), "not a readable bag"),
     ],
 )
-def test_files_that_are_not_bags_are_refused_with_the_reason(
-    tmp_path: Path, name: str, content: bytes, reason: str
-) -> None:
+def test_files_that_are_not_bags_are_refused_with_the_reason(tmp_path, name, content, reason):
     path = tmp_path / name
     path.write_bytes(content)
     with pytest.raises(BagError, match=reason) as refused:
@@ -238,14 +219,14 @@ def test_files_that_are_not_bags_are_refused_with_the_reason(
 
 
 @pytest.mark.parametrize("storage", ["mcap", "db3"])
-def test_an_empty_bag_is_refused_with_the_missing_topics(tmp_path: Path, storage: str) -> None:
+def test_an_empty_bag_is_refused_with_the_missing_topics(tmp_path, storage):
     write = write_mcap if storage == "mcap" else write_sqlite
     path = write(tmp_path / f"bag.{storage}", [])
     with pytest.raises(BagError, match="no topics at all"):
         read_records(path)
 
 
-def test_a_topic_without_messages_is_refused_by_its_name(tmp_path: Path) -> None:
+def test_a_topic_without_messages_is_refused_by_its_name(tmp_path):
     path = write_sqlite(tmp_path / "bag.db3", motion(n=20).messages())
     with sqlite3.connect(path) as database:
         database.execute("DELETE FROM messages WHERE topic_id = 2")
@@ -253,7 +234,7 @@ def test_a_topic_without_messages_is_refused_by_its_name(tmp_path: Path) -> None
         read_records(path)
 
 
-def test_types_defined_as_idl_are_understood(tmp_path: Path) -> None:
+def test_types_defined_as_idl_are_understood(tmp_path):
     text = (
         "module odd_msgs {\n module msg {\n  struct Speed {\n   string label;\n"
         '   sequence<double> values;\n   @unit(value="V")\n   float volts;\n  };\n };\n};\n'
@@ -275,7 +256,7 @@ def test_types_defined_as_idl_are_understood(tmp_path: Path) -> None:
     assert set(record.voltage) == {4.0}
 
 
-def test_a_wheel_that_never_spoke_does_not_hide_the_others(tmp_path: Path) -> None:
+def test_a_wheel_that_never_spoke_does_not_hide_the_others(tmp_path):
     silent = motion(n=20, wheel="rear_left").messages()
     spoken = motion(n=20).messages()
     path = write_sqlite(tmp_path / "bag.db3", spoken + silent)

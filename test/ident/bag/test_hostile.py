@@ -11,6 +11,6 @@ HOSTILE = load("hostile")
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", list(HOSTILE.CASES))
-def test_a_claim_costs_no_more_than_the_size_of_its_file(name: str) -> None:
+def test_a_claim_costs_no_more_than_the_size_of_its_file(name):
     told, memory, wrong = HOSTILE.read(name)
     assert not wrong, (told, f"{memory / 1e6:.0f} MB")

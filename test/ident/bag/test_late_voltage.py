@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import time
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -39,7 +38,7 @@ def noisy(speed: np.ndarray, share: float = 0.01) -> np.ndarray:
 
 @pytest.mark.parametrize("drive", list(DRIVES))
 @pytest.mark.parametrize("rows", [2, 3, 10, 40])
-def test_the_rows_that_a_command_is_late_are_found(drive: str, rows: int) -> None:
+def test_the_rows_that_a_command_is_late_are_found(drive, rows):
     if drive == "square" and rows > 10:
         pytest.skip("of a square wave most of a half period late is as well the rest of it ahead")
     speed = noisy(turned(DRIVES[drive]))
@@ -50,12 +49,12 @@ def test_the_rows_that_a_command_is_late_are_found(drive: str, rows: int) -> Non
 @pytest.mark.parametrize("drive", [*DRIVES, "sine"])
 @pytest.mark.parametrize("winding", [0.0, 2.0])
 @pytest.mark.parametrize("lag", [2.0, 50.0])
-def test_a_punctual_command_is_not_moved(drive: str, lag: float, winding: float) -> None:
+def test_a_punctual_command_is_not_moved(drive, lag, winding):
     voltage = DRIVES.get(drive, 6 * np.sin(np.arange(N) * 2 * np.pi / 150))
     assert find_late_rows(voltage, noisy(turned(voltage, lag, winding))) == 0
 
 
-def test_noise_fed_back_by_a_loop_does_not_move_the_command() -> None:
+def test_noise_fed_back_by_a_loop_does_not_move_the_command():
     target, speed, rows = np.repeat(RNG.uniform(-100, 100, N // 50), 50), 0.0, []
     for k in range(N):
         measured = speed + RNG.normal(0, 3)
@@ -66,7 +65,7 @@ def test_noise_fed_back_by_a_loop_does_not_move_the_command() -> None:
     assert find_late_rows(voltage, measured) == 0
 
 
-def test_it_is_told_in_milliseconds() -> None:
+def test_it_is_told_in_milliseconds():
     voltage = RNG.normal(size=20_000)
     find_late_rows(voltage[:500], voltage[:500])  # compiles
     begin = time.perf_counter()
@@ -75,7 +74,7 @@ def test_it_is_told_in_milliseconds() -> None:
 
 
 @pytest.mark.parametrize("motion", ["velocity", "count"])
-def test_a_late_column_is_moved_back_in_every_segment(tmp_path: Path, motion: str) -> None:
+def test_a_late_column_is_moved_back_in_every_segment(tmp_path, motion):
     voltage, path = DRIVES["levels"], tmp_path / "log.csv"
     speed = turned(voltage)
     moved = speed if motion == "velocity" else np.rint(np.cumsum(speed) * 0.01 * 318)

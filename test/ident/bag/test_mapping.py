@@ -3,8 +3,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 
@@ -37,7 +35,7 @@ from smp_motor_ident.errors import BagError
         ("time=Timestamp(ms):ms", Signal("", "Timestamp(ms)", 1.0, 0.0, "ms")),
     ],
 )
-def test_a_signal_is_read_from_its_text(text: str, signal: Signal) -> None:
+def test_a_signal_is_read_from_its_text(text, signal):
     name = text.partition("=")[0]
     mapping = parse([text])
     signals = mapping.motors["motor"].signals if mapping.motors else mapping.defaults.signals
@@ -52,7 +50,7 @@ def test_a_signal_is_read_from_its_text(text: str, signal: Signal) -> None:
     )
 
 
-def test_the_same_is_written_in_yaml_and_on_the_command_line(tmp_path: Path) -> None:
+def test_the_same_is_written_in_yaml_and_on_the_command_line(tmp_path):
     file = tmp_path / "map.yaml"
     file.write_text(
         "supply_voltage: 12\n"
@@ -99,7 +97,7 @@ def test_the_same_is_written_in_yaml_and_on_the_command_line(tmp_path: Path) -> 
         ("left.velocity=/a.b voltage=/c.d", "needs its wheel"),
     ],
 )
-def test_invalid_values_are_named_with_the_valid_ones(item: str, reason: str) -> None:
+def test_invalid_values_are_named_with_the_valid_ones(item, reason):
     with pytest.raises(BagError) as refused:
         parse([item])
     assert reason in str(refused.value)
@@ -119,7 +117,7 @@ def test_invalid_values_are_named_with_the_valid_ones(item: str, reason: str) ->
         "\tx: 1",
     ],
 )
-def test_a_file_that_is_not_a_mapping_is_refused_by_its_name(tmp_path: Path, text: str) -> None:
+def test_a_file_that_is_not_a_mapping_is_refused_by_its_name(tmp_path, text):
     file = tmp_path / "map.yaml"
     file.write_text(text)
     with pytest.raises(BagError, match=r"map\.yaml") as refused:
@@ -127,12 +125,12 @@ def test_a_file_that_is_not_a_mapping_is_refused_by_its_name(tmp_path: Path, tex
     assert "\n" not in str(refused.value)
 
 
-def test_a_mapping_file_that_does_not_exist_is_named(tmp_path: Path) -> None:
+def test_a_mapping_file_that_does_not_exist_is_named(tmp_path):
     with pytest.raises(BagError, match=r"nothing\.yaml"):
         load(tmp_path / "nothing.yaml")
 
 
-def test_a_level_that_no_column_holds_is_written_in_the_mapping(tmp_path: Path) -> None:
+def test_a_level_that_no_column_holds_is_written_in_the_mapping(tmp_path):
     path = tmp_path / "step_12V.csv"
     path.write_text("t,w\n" + "\n".join(f"{0.01 * k},{20 * k}" for k in range(30)))
     record = read_records(path, ["voltage=w*0+12 velocity=w time=t"])["motor"]
@@ -140,6 +138,6 @@ def test_a_level_that_no_column_holds_is_written_in_the_mapping(tmp_path: Path) 
 
 
 @pytest.mark.parametrize("name", ["a-b", "1", "a b", "ä", "a\n"])
-def test_a_wheel_needs_a_ros_name(name: str) -> None:
+def test_a_wheel_needs_a_ros_name(name):
     with pytest.raises(BagError, match="is not a ROS name"):
         of({"motors": {name: {"voltage": "u", "velocity": "y"}}})

@@ -6,7 +6,6 @@ from __future__ import annotations
 import struct
 import subprocess
 import sys
-from pathlib import Path
 
 import mcap.writer
 import pytest
@@ -33,7 +32,7 @@ ZSTD = mcap.writer.CompressionType.ZSTD
     ],
     ids=str,
 )
-def test_summary_is_that_of_the_mcap_library(tmp_path: Path, options):
+def test_summary_is_that_of_the_mcap_library(tmp_path, options):
     messages = merged(motion(n=100), motion(n=70, wheel="rear_right", seed=2))
     path = write_mcap(tmp_path / "bag.mcap", messages, **options)
     with path.open("rb") as file:
@@ -59,7 +58,7 @@ def test_summary_is_that_of_the_mcap_library(tmp_path: Path, options):
     assert len(read_records(path)["rear_right"]) == 70
 
 
-def test_damage_to_any_byte_of_the_summary_loses_no_message_silently(tmp_path: Path):
+def test_damage_to_any_byte_of_the_summary_loses_no_message_silently(tmp_path):
     path = write_mcap(tmp_path / "bag.mcap", motion(n=60).messages(), defined=False)
     whole = path.read_bytes()
     (begin,) = struct.unpack_from("<Q", whole, len(whole) - 28)  # the footer's summary_start

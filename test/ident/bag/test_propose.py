@@ -44,7 +44,7 @@ def write(path: Path, **columns: Sequence[float]) -> Path:
     return path
 
 
-def test_a_bag_of_two_wheels_is_mapped_and_the_pwms_full_scale_asked_for(tmp_path: Path) -> None:
+def test_a_bag_of_two_wheels_is_mapped_and_the_pwms_full_scale_asked_for(tmp_path):
     (u, y), (v, z) = motor(1), motor(2)
     twist, vector = "geometry_msgs/msg/Twist", TYPES.types["geometry_msgs/msg/Vector3"]
     at = START + np.rint(1e9 * T).astype(np.int64)
@@ -90,22 +90,20 @@ def test_a_bag_of_two_wheels_is_mapped_and_the_pwms_full_scale_asked_for(tmp_pat
         ),
     ],
 )
-def test_names_of_other_languages_and_units_in_brackets_are_understood(
-    tmp_path: Path, names: tuple[str, str, str], suggestion: list[str]
-) -> None:
+def test_names_of_other_languages_and_units_in_brackets_are_understood(tmp_path, names, suggestion):
     path = write(tmp_path / "log.csv", **dict(zip(names, (T, *motor(3)))))
     assert list_topics(path)[0].suggestion[:2] == suggestion
     assert len(read_records(path, list_topics(path)[0].suggestion)["motor"]) == N
 
 
-def test_of_two_voltages_the_one_that_explains_the_speed_is_proposed(tmp_path: Path) -> None:
+def test_of_two_voltages_the_one_that_explains_the_speed_is_proposed(tmp_path):
     voltage, speed = motor(4)
     other = motor(5)[0]
     path = write(tmp_path / "log.csv", t=T, u_other=other, input_volts=voltage, omega=speed)
     assert list_topics(path)[0].suggestion[0] == "voltage=input_volts"
 
 
-def test_nothing_is_proposed_where_nothing_explains_the_speed(tmp_path: Path) -> None:
+def test_nothing_is_proposed_where_nothing_explains_the_speed(tmp_path):
     path = write(tmp_path / "log.csv", t=T, voltage=motor(6)[0], speed=motor(7)[1])
     assert list_topics(path)[0].suggestion == []
 
@@ -118,9 +116,7 @@ def test_nothing_is_proposed_where_nothing_explains_the_speed(tmp_path: Path) ->
         pytest.param(100, 500, "changes 2 times only", id="on and off"),
     ],
 )
-def test_a_step_that_no_test_can_confirm_is_proposed_by_names(
-    tmp_path: Path, begin: int, end: int, remark: str
-) -> None:
+def test_a_step_that_no_test_can_confirm_is_proposed_by_names(tmp_path, begin, end, remark):
     voltage = np.where((np.arange(N) >= begin) & (np.arange(N) < end), 12.0, 0.0)
     speed = 240 * (1 - np.exp(-np.maximum(T - T[begin], 0) / 0.1))
     speed += np.random.default_rng(8).normal(0, 5, N)
@@ -140,16 +136,14 @@ def test_a_step_that_no_test_can_confirm_is_proposed_by_names(
         (("t", "voltage", "speed"), "no field that is called a voltage explains one that"),
     ],
 )
-def test_why_nothing_is_proposed_is_told(
-    tmp_path: Path, names: tuple[str, str, str], reason: str
-) -> None:
+def test_why_nothing_is_proposed_is_told(tmp_path, names, reason):
     path = write(tmp_path / "log.csv", **dict(zip(names, (T, motor(6)[0], motor(7)[1]))))
     listing = list_topics(path)[0]
     assert listing.suggestion == []
     assert listing.remark.startswith(reason)
 
 
-def test_a_mapping_of_the_rim_asks_for_the_wheels_radius(tmp_path: Path) -> None:
+def test_a_mapping_of_the_rim_asks_for_the_wheels_radius(tmp_path):
     path = write(tmp_path / "log.csv", **dict(zip(("t", "u", "speed (m/s)"), (T, *motor(9)))))
     listing = list_topics(path)[0]
     assert listing.suggestion[1] == 'velocity="speed (m/s)":m/s'
@@ -170,9 +164,7 @@ def asked(listing: Listing) -> list[str]:
         (("a", "b", "encoder"), ";", ["voltage=b:pwm", "count=encoder", "time=a"]),
     ],
 )
-def test_where_names_tell_too_little_the_data_do(
-    tmp_path: Path, names: tuple[str, ...] | None, separator: str, suggestion: list[str]
-) -> None:
+def test_where_names_tell_too_little_the_data_do(tmp_path, names, separator, suggestion):
     voltage, speed = motor(10)
     columns = (10 * np.arange(N), np.rint(voltage / 6 * 255), np.rint(np.cumsum(speed) / 20))
     lines = [separator.join(f"{x:.0f}" for x in row) for row in zip(*columns)]
@@ -190,7 +182,7 @@ def test_where_names_tell_too_little_the_data_do(
 
 
 @pytest.mark.parametrize("error", ["Erro", "error", "Fehler", "ang_err"])
-def test_the_error_of_a_loop_is_not_a_motion(tmp_path: Path, error: str) -> None:
+def test_the_error_of_a_loop_is_not_a_motion(tmp_path, error):
     voltage, speed = motor(12)
     rows = zip(T, 300.0 - speed, voltage)
     text = "\n".join(f"{t:.2f};{e:.4f};{v:.4f}" for t, e, v in rows)
@@ -199,7 +191,7 @@ def test_the_error_of_a_loop_is_not_a_motion(tmp_path: Path, error: str) -> None
     assert listing.suggestion == [] and listing.remark == "no field is called a motion"
 
 
-def test_a_speed_is_not_proposed_as_the_voltage_of_its_own_angle(tmp_path: Path) -> None:
+def test_a_speed_is_not_proposed_as_the_voltage_of_its_own_angle(tmp_path):
     speed = motor(11)[1]
     rows = zip(T, np.cumsum(speed) * 0.01, speed)
     (tmp_path / "log.txt").write_text("\n".join(f"{t:.2f} {a:.4f} {w:.4f}" for t, a, w in rows))
@@ -208,7 +200,7 @@ def test_a_speed_is_not_proposed_as_the_voltage_of_its_own_angle(tmp_path: Path)
     assert listing.remark == "no field is called a voltage or a motion"
 
 
-def test_the_interval_of_a_table_without_time_is_asked_for(tmp_path: Path) -> None:
+def test_the_interval_of_a_table_without_time_is_asked_for(tmp_path):
     path = write(tmp_path / "log.csv", **dict(zip("uy", motor(12))))
     listing = list_topics(path)[0]
     assert listing.suggestion == ["voltage=u", "velocity=y"]
@@ -225,9 +217,7 @@ def test_the_interval_of_a_table_without_time_is_asked_for(tmp_path: Path) -> No
         ("duty_percent", 1.0, ":%", ["supply_voltage"]),
     ],
 )
-def test_the_scale_of_a_duty_is_named_or_asked_for(
-    tmp_path: Path, name: str, full: float, unit: str, told: list[str]
-) -> None:
+def test_the_scale_of_a_duty_is_named_or_asked_for(tmp_path, name, full, unit, told):
     voltage, speed = motor(13)
     path = write(tmp_path / "log.csv", **{"t_ms": 1e3 * T, name: voltage / 6 * full, "w": speed})
     listing = list_topics(path)[0]
@@ -235,7 +225,7 @@ def test_the_scale_of_a_duty_is_named_or_asked_for(
     assert asked(listing) == told
 
 
-def test_a_size_is_proposed_with_its_direction(tmp_path: Path) -> None:
+def test_a_size_is_proposed_with_its_direction(tmp_path):
     voltage, speed = motor(14)
     columns = {"t": T, "u": np.abs(voltage), "dir": voltage > 0, "w": speed}
     listing = list_topics(write(tmp_path / "log.csv", **columns))[0]
@@ -251,7 +241,7 @@ def test_a_size_is_proposed_with_its_direction(tmp_path: Path) -> None:
     assert listing.suggestion == ["voltage=u", "velocity=w", "time=t"]
 
 
-def test_fractional_numbers_are_not_counts(tmp_path: Path) -> None:
+def test_fractional_numbers_are_not_counts(tmp_path):
     voltage, speed = motor(15)
     path = write(tmp_path / "log.csv", t=T, u=voltage, encoder=np.cumsum(speed) * 0.01)
     assert list_topics(path)[0].suggestion == ["voltage=u", "position=encoder", "time=t"]
@@ -269,9 +259,7 @@ def test_fractional_numbers_are_not_counts(tmp_path: Path) -> None:
         (("t", "dutyIzquierda", "dutyDerecha", "velIzquierda", "velDerecha"), None),
     ],
 )
-def test_motors_are_told_apart_by_the_endings_of_names(
-    tmp_path: Path, names: tuple[str, ...], wheels: tuple[str, str] | None
-) -> None:
+def test_motors_are_told_apart_by_the_endings_of_names(tmp_path, names, wheels):
     (u, y), (v, z) = motor(21), motor(22)
     path = write(tmp_path / "log.csv", **dict(zip(names, (T, u, v, y, z))))
     a, b = wheels or ("izquierda", "derecha")
@@ -285,14 +273,14 @@ def test_motors_are_told_apart_by_the_endings_of_names(
     assert sorted(items) == sorted([*expected, f"time={names[0]}"])
 
 
-def test_one_voltage_is_of_all_motors_that_stand_side_by_side(tmp_path: Path) -> None:
+def test_one_voltage_is_of_all_motors_that_stand_side_by_side(tmp_path):
     u, y = motor(23)
     path = write(tmp_path / "log.csv", t=T, u=u, velL=y, velR=0.9 * y)
     found = ["left.voltage=u", "left.velocity=velL", "right.voltage=u", "right.velocity=velR"]
     assert list_topics(path)[0].suggestion == [*found, "time=t"]
 
 
-def test_a_vin_that_is_switched_drives_and_one_that_stays_supplies(tmp_path: Path) -> None:
+def test_a_vin_that_is_switched_drives_and_one_that_stays_supplies(tmp_path):
     voltage, speed = motor(24)
     path = write(tmp_path / "lab.csv", time=T, Vin=voltage, taco=speed)
     assert list_topics(path)[0].suggestion == ["voltage=Vin", "velocity=taco", "time=time"]
@@ -301,7 +289,7 @@ def test_a_vin_that_is_switched_drives_and_one_that_stays_supplies(tmp_path: Pat
     assert list_topics(path)[0].remark == "no field is called a voltage"
 
 
-def test_the_nearest_word_determines_the_role_of_a_field(tmp_path: Path) -> None:
+def test_the_nearest_word_determines_the_role_of_a_field(tmp_path):
     voltage, speed = motor(25)
     names = ("Vin_test.taco.time", "Vin_test.taco.values", "Vin_test.Vin.values")
     path = write(tmp_path / "log.csv", **dict(zip(names, (T, speed, voltage))))
@@ -310,14 +298,14 @@ def test_the_nearest_word_determines_the_role_of_a_field(tmp_path: Path) -> None
     assert list_topics(path)[0].suggestion == items
 
 
-def test_a_chance_correlation_is_not_proposed(tmp_path: Path) -> None:
+def test_a_chance_correlation_is_not_proposed(tmp_path):
     rng = np.random.default_rng(26)
     columns = {f"signal_{chr(97 + k)}": np.cumsum(rng.normal(0, 1, 32)) for k in range(16)}
     listing = list_topics(write(tmp_path / "log.csv", **columns))[0]
     assert listing.suggestion == []
 
 
-def test_columns_of_one_length_are_listed_and_proposed_together(tmp_path: Path) -> None:
+def test_columns_of_one_length_are_listed_and_proposed_together(tmp_path):
     voltage, speed = motor(27)
     content = {"id": {"InputData": voltage, "OutputData": speed, "last": np.arange(6.0)}, "t": T}
     scipy.io.savemat(tmp_path / "lab.mat", content | {"limits": np.array([-12.0, 12.0])})
@@ -334,7 +322,7 @@ def test_columns_of_one_length_are_listed_and_proposed_together(tmp_path: Path) 
         read_records(tmp_path / "lab.mat", ["voltage=limits", *items[1:]])
 
 
-def test_counts_of_an_interval_are_no_angle_and_volts_go_before_their_pwm(tmp_path: Path) -> None:
+def test_counts_of_an_interval_are_no_angle_and_volts_go_before_their_pwm(tmp_path):
     voltage, speed = motor(11)
     columns = {"t": T, "pwm": np.rint(voltage / 12 * 999), "Voltage_V": np.round(voltage, 3)}
     counts = np.rint(speed * 20)
@@ -345,7 +333,7 @@ def test_counts_of_an_interval_are_no_angle_and_volts_go_before_their_pwm(tmp_pa
     assert list_topics(path)[0].suggestion == ["voltage=Voltage_V", "count=encoder", "time=t"]
 
 
-def test_a_power_of_a_motor_goes_before_another_wheels_speed(tmp_path: Path) -> None:
+def test_a_power_of_a_motor_goes_before_another_wheels_speed(tmp_path):
     voltage, speed = motor(12)
     other = np.convolve(speed, [0.0, 0.5, 0.5])[:N]
     columns = {"t": T, "powerPctLeft": np.rint(voltage * 10), "vLeft": speed, "vRight": other}
@@ -354,7 +342,7 @@ def test_a_power_of_a_motor_goes_before_another_wheels_speed(tmp_path: Path) -> 
     assert listing.suggestion[1].startswith("velocity=v")
 
 
-def test_an_angle_that_starts_again_at_360_is_in_degrees(tmp_path: Path) -> None:
+def test_an_angle_that_starts_again_at_360_is_in_degrees(tmp_path):
     voltage, speed = motor(13)
     angle = np.rad2deg(np.cumsum(speed) * 0.001) % 360
     listing = list_topics(write(tmp_path / "log.csv", t=T, volts=voltage, angle=angle))[0]
@@ -382,9 +370,7 @@ def efforts(kind: str, seed: int = 1) -> np.ndarray:
 
 @pytest.mark.parametrize("kind", ["zeros", "nan", "current"])
 @pytest.mark.parametrize("drive", ["pwm", "wheel_command"])
-def test_an_effort_is_not_proposed_in_place_of_the_drive(
-    tmp_path: Path, kind: str, drive: str
-) -> None:
+def test_an_effort_is_not_proposed_in_place_of_the_drive(tmp_path, kind, drive):
     sent = robot("", efforts(kind), 1, drive)
     listing = list_topics(write_mcap(tmp_path / "bag.mcap", sent))[0]
     assert listing.suggestion == [
@@ -394,14 +380,14 @@ def test_an_effort_is_not_proposed_in_place_of_the_drive(
     assert asked(listing) == ["pwm_full_scale", "supply_voltage"]
 
 
-def test_an_effort_that_alone_explains_the_motion_is_proposed_with_a_note(tmp_path: Path) -> None:
+def test_an_effort_that_alone_explains_the_motion_is_proposed_with_a_note(tmp_path):
     sent = [s for s in robot("", motor(1)[0], 1) if "pwm" not in s.topic]
     listing = list_topics(write_mcap(tmp_path / "bag.mcap", sent))[0]
     assert listing.suggestion[0] == "left.voltage=/joint_states.effort[left_wheel]"
     assert "is a torque [N m] by its message's documentation" in listing.remark
 
 
-def test_every_robot_of_a_bag_is_proposed(tmp_path: Path) -> None:
+def test_every_robot_of_a_bag_is_proposed(tmp_path):
     both = [m for k in (1, 2) for m in robot(f"/robot{k}", np.zeros(N), k)]
     path = write_mcap(tmp_path / "bag.mcap", sorted(both, key=lambda m: m.stamp))
     listing = list_topics(path)[0]
@@ -418,7 +404,7 @@ def test_every_robot_of_a_bag_is_proposed(tmp_path: Path) -> None:
     np.testing.assert_allclose(records["robot2_left"].velocity, motor(2)[1])
 
 
-def test_a_time_is_not_proposed_as_a_voltage(tmp_path: Path) -> None:
+def test_a_time_is_not_proposed_as_a_voltage(tmp_path):
     voltage, speed = motor(1)
     path = write(tmp_path / "log.csv", t=T, input=1e3 * T, pwm=voltage, speed=speed)
     assert list_topics(path)[0].suggestion[:2] == ["voltage=pwm:pwm", "velocity=speed"]
@@ -426,7 +412,7 @@ def test_a_time_is_not_proposed_as_a_voltage(tmp_path: Path) -> None:
     assert list_topics(path)[0].suggestion == []
 
 
-def test_a_place_is_not_proposed_where_a_speed_is_named(tmp_path: Path) -> None:
+def test_a_place_is_not_proposed_where_a_speed_is_named(tmp_path):
     voltage, speed = motor(1)
     columns = {"pose.x": voltage, "pose.y": np.cumsum(speed), "speed": speed}
     path = write(tmp_path / "log.csv", t=T, **columns, motor_current=0.3 * voltage)
@@ -434,7 +420,7 @@ def test_a_place_is_not_proposed_where_a_speed_is_named(tmp_path: Path) -> None:
     assert listing.suggestion == [] and listing.remark == "no field is called a voltage"
 
 
-def test_columns_of_a_pose_are_not_a_drive(tmp_path: Path) -> None:
+def test_columns_of_a_pose_are_not_a_drive(tmp_path):
     voltage, speed = motor(1)
     theta = 0.01 * np.cumsum(speed)
     path = write(tmp_path / "log.csv", x=voltage, y=np.cumsum(speed), theta=theta, omega=speed)
@@ -442,7 +428,7 @@ def test_columns_of_a_pose_are_not_a_drive(tmp_path: Path) -> None:
     assert listing.suggestion == []
 
 
-def test_a_speed_command_is_not_proposed_as_a_voltage(tmp_path: Path) -> None:
+def test_a_speed_command_is_not_proposed_as_a_voltage(tmp_path):
     voltage, speed = motor(1)
     path = write(tmp_path / "log.csv", t=T, speed_cmd=20 * voltage, u=voltage, speed=speed)
     assert list_topics(path)[0].suggestion[0] == "voltage=u"
@@ -451,7 +437,7 @@ def test_a_speed_command_is_not_proposed_as_a_voltage(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("column", ["position", "voltage"])
-def test_a_column_without_a_number_is_named(tmp_path: Path, column: str) -> None:
+def test_a_column_without_a_number_is_named(tmp_path, column):
     columns = {"t": T, "voltage": motor(1)[0], "position": np.cumsum(motor(1)[1])}
     path = write(tmp_path / "log.csv", **{**columns, column: np.full(N, np.nan)})
     listing = list_topics(path)[0]
@@ -462,7 +448,7 @@ def test_a_column_without_a_number_is_named(tmp_path: Path, column: str) -> None
 @pytest.mark.parametrize(
     "name", ["speed (rad/s)", "speed-2", 'a "fast" speed', "speed b=c", "v: speed", "/a.speed*2"]
 )
-def test_a_name_that_is_printed_is_accepted_back(tmp_path: Path, name: str) -> None:
+def test_a_name_that_is_printed_is_accepted_back(tmp_path, name):
     voltage, speed = motor(1)
     path = tmp_path / "my log.csv"
     quoted = '"' + name.replace('"', '""') + '"'

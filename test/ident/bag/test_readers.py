@@ -39,20 +39,20 @@ def assert_motor(record: Any, n: int = N, speed: np.ndarray = SPEED) -> None:
     np.testing.assert_allclose(record.velocity, speed[:n], rtol=1e-15)  # one factor of a unit
 
 
-def test_every_format_is_registered_once() -> None:
+def test_every_format_is_registered_once():
     names = [form.name for form in FORMATS]
     assert len(names) == len(set(names)) >= 9
 
 
 @pytest.mark.parametrize("compressed", [False, True])
-def test_vectors_of_a_matlab_file_are_columns(tmp_path: Path, compressed: bool) -> None:
+def test_vectors_of_a_matlab_file_are_columns(tmp_path, compressed):
     path = tmp_path / "log.mat"
     content = {"t": TIME, "u": VOLTAGE[:, None], "y": SPEED, "note": "a motor", "fs": 100.0}
     scipy.io.savemat(path, content, do_compression=compressed)
     assert_motor(read_records(path, MAP)["motor"])
 
 
-def test_fields_of_a_matlab_structure_and_columns_of_a_matrix_have_paths(tmp_path: Path) -> None:
+def test_fields_of_a_matlab_structure_and_columns_of_a_matrix_have_paths(tmp_path):
     path = tmp_path / "log.mat"
     log = {"time": TIME, "signals": {"values": np.stack([VOLTAGE, SPEED], axis=1)}}
     scipy.io.savemat(path, {"log": log}, do_compression=True)
@@ -60,7 +60,7 @@ def test_fields_of_a_matlab_structure_and_columns_of_a_matrix_have_paths(tmp_pat
     assert_motor(read_records(path, mapping)["motor"])
 
 
-def test_signals_of_a_simulink_scope_and_cells_have_their_places_as_paths(tmp_path: Path) -> None:
+def test_signals_of_a_simulink_scope_and_cells_have_their_places_as_paths(tmp_path):
     path = tmp_path / "log.mat"
     kinds = [("values", object), ("dimensions", object), ("label", object)]
     signals = np.array([(VOLTAGE, 1, "u"), (SPEED, 1, "w")], dtype=kinds)
@@ -90,9 +90,7 @@ def matlab_object(name: str, kind: str, order: str = "<") -> bytes:
 
 
 @pytest.mark.parametrize("compressed", [False, True])
-def test_objects_of_matlab_are_named_and_the_other_variables_read(
-    tmp_path: Path, compressed: bool
-) -> None:
+def test_objects_of_matlab_are_named_and_the_other_variables_read(tmp_path, compressed):
     path = tmp_path / "log.mat"
     scipy.io.savemat(path, {"t": TIME, "u": VOLTAGE, "y": SPEED}, do_compression=compressed)
     one, two = matlab_object("speedSeries", "timeseries"), matlab_object("out", "Simulink.Data")
@@ -111,7 +109,7 @@ def test_objects_of_matlab_are_named_and_the_other_variables_read(
         list_topics(path)
 
 
-def test_objects_of_version_7_3_are_named_and_the_other_variables_read(tmp_path: Path) -> None:
+def test_objects_of_version_7_3_are_named_and_the_other_variables_read(tmp_path):
     path = tmp_path / "log.mat"
     with h5py.File(path, "w", userblock_size=512) as file:
         for name, values in {"t": TIME, "u": VOLTAGE, "y": SPEED}.items():
@@ -127,7 +125,7 @@ def test_objects_of_version_7_3_are_named_and_the_other_variables_read(tmp_path:
     assert len(said) == 1 and "data (Simulink.SimulationData.Dataset)" in said[0]
 
 
-def test_a_matlab_file_of_version_4_has_signals_in_its_rows(tmp_path: Path) -> None:
+def test_a_matlab_file_of_version_4_has_signals_in_its_rows(tmp_path):
     path = tmp_path / "log.mat"
     content = {"data": np.stack([TIME, VOLTAGE, SPEED]), "note": "QUARC", "fs": np.float32(100)}
     scipy.io.savemat(path, content, format="4")
@@ -139,7 +137,7 @@ def test_a_matlab_file_of_version_4_has_signals_in_its_rows(tmp_path: Path) -> N
         list_topics(path)
 
 
-def test_a_matlab_file_of_another_version_or_cut_off_is_one_line(tmp_path: Path) -> None:
+def test_a_matlab_file_of_another_version_or_cut_off_is_one_line(tmp_path):
     hdf = tmp_path / "new.mat"
     hdf.write_bytes(b"MATLAB 7.3 MAT-file, Platform: GLNXA64".ljust(512) + b"\x89HDF\r\n\x1a\n")
     with pytest.raises(BagError, match=r"h5py|no readable MATLAB"):
@@ -176,7 +174,7 @@ def data_log(extra: bytes = b"") -> bytes:
     return b"".join(parts)
 
 
-def test_entries_of_a_wpilib_data_log_are_signals_with_their_own_times(tmp_path: Path) -> None:
+def test_entries_of_a_wpilib_data_log_are_signals_with_their_own_times(tmp_path):
     path = tmp_path / "robot.wpilog"
     path.write_bytes(data_log(b"extra header"))
     mapping = ['voltage="/drive/left volts"', 'velocity="NT:left/speed[1]"']
@@ -187,7 +185,7 @@ def test_entries_of_a_wpilib_data_log_are_signals_with_their_own_times(tmp_path:
     ]
 
 
-def test_of_a_data_log_that_is_cut_off_the_rest_is_read(tmp_path: Path) -> None:
+def test_of_a_data_log_that_is_cut_off_the_rest_is_read(tmp_path):
     path = tmp_path / "robot.wpilog"
     whole = data_log()
     path.write_bytes(whole[: len(whole) // 2])
@@ -225,8 +223,8 @@ RATE = SPEED / (2 * np.pi)  # rotations a second
     ],
 )
 def test_rotations_of_sysid_are_converted_by_its_units_per_rotation(
-    tmp_path: Path, units: str, per_rotation: float, mapping: list[str] | None
-) -> None:
+    tmp_path, units, per_rotation, mapping
+):
     # docs/data-collection.md: "all positions and velocities should be in rotations"
     path = tmp_path / "sysid.json"
     sysid(path, [TIME, VOLTAGE, TURNS, RATE], units=units, unitsPerRotation=per_rotation)
@@ -235,7 +233,7 @@ def test_rotations_of_sysid_are_converted_by_its_units_per_rotation(
     np.testing.assert_allclose(record.position, 2 * np.pi * TURNS, atol=1e-9)
 
 
-def test_each_test_of_sysid_is_a_segment(tmp_path: Path) -> None:
+def test_each_test_of_sysid_is_a_segment(tmp_path):
     time = TIME + 10.0 * np.repeat(np.arange(4), N // 4)
     path = tmp_path / "sysid.json"
     sysid(path, [time, VOLTAGE, TURNS, RATE], units="Rotations", unitsPerRotation=1.0)
@@ -250,7 +248,7 @@ def drivetrain(path: Path) -> Path:
     return sysid(path, columns, **keys)
 
 
-def test_a_sysid_drivetrain_in_metres_needs_the_wheels_radius_only(tmp_path: Path) -> None:
+def test_a_sysid_drivetrain_in_metres_needs_the_wheels_radius_only(tmp_path):
     path = drivetrain(tmp_path / "sysid.json")
     with pytest.raises(BagError, match="give --map wheel_radius=METRES"):
         read_records(path)
@@ -263,7 +261,7 @@ def test_a_sysid_drivetrain_in_metres_needs_the_wheels_radius_only(tmp_path: Pat
     np.testing.assert_allclose(apart["right"].velocity, -0.5 * SPEED, atol=1e-9)
 
 
-def test_the_suggestion_for_a_drivetrain_in_metres_requests_the_radius(tmp_path: Path) -> None:
+def test_the_suggestion_for_a_drivetrain_in_metres_requests_the_radius(tmp_path):
     path = drivetrain(tmp_path / "sysid.json")
     listing = list_topics(path)[0]
     assert "left.velocity=left_velocity:m/s" in listing.suggestion
@@ -274,7 +272,7 @@ def test_the_suggestion_for_a_drivetrain_in_metres_requests_the_radius(tmp_path:
 
 
 @pytest.mark.parametrize("keys", [{}, {"units": "Radians"}])
-def test_rows_of_its_forerunner_have_six_columns(tmp_path: Path, keys: dict[str, object]) -> None:
+def test_rows_of_its_forerunner_have_six_columns(tmp_path, keys):
     # frc-characterization, arm-characterization/data_analyzer.py of 2019: ``columns``
     path = tmp_path / "arm.json"
     battery, speed = np.full(N, 12.5), VOLTAGE / 12.5
@@ -285,7 +283,7 @@ def test_rows_of_its_forerunner_have_six_columns(tmp_path: Path, keys: dict[str,
     np.testing.assert_allclose(record.voltage[1:], VOLTAGE[:-1])
 
 
-def test_a_mechanism_of_its_forerunner_is_in_the_left_columns(tmp_path: Path) -> None:
+def test_a_mechanism_of_its_forerunner_is_in_the_left_columns(tmp_path):
     # frc-characterization, Robot.java.mako since April 2020: ten columns in rotations
     path = tmp_path / "simple.json"
     zero = np.zeros(N)
@@ -297,7 +295,7 @@ def test_a_mechanism_of_its_forerunner_is_in_the_left_columns(tmp_path: Path) ->
 
 
 @pytest.mark.parametrize("form", ["rows", "columns", "lines", "nested"])
-def test_json_logs_of_any_shape_are_read(tmp_path: Path, form: str) -> None:
+def test_json_logs_of_any_shape_are_read(tmp_path, form):
     rows = [
         {"t": t, "u": u, "y": y, "state": "run"}
         for t, u, y in zip(TIME.tolist(), VOLTAGE.tolist(), SPEED.tolist())
@@ -320,7 +318,7 @@ def test_json_logs_of_any_shape_are_read(tmp_path: Path, form: str) -> None:
     assert any(f.code == "damaged_recording" for f in record.findings) is (form == "lines")
 
 
-def test_messages_of_several_kinds_in_one_jsonl_are_told_apart(tmp_path: Path) -> None:
+def test_messages_of_several_kinds_in_one_jsonl_are_told_apart(tmp_path):
     path = tmp_path / "log.jsonl"
     lines = []
     for t, u, y in zip(TIME.tolist(), VOLTAGE.tolist(), SPEED.tolist()):
@@ -332,7 +330,7 @@ def test_messages_of_several_kinds_in_one_jsonl_are_told_apart(tmp_path: Path) -
     np.testing.assert_allclose(seen, SPEED[-seen.size :], rtol=1e-12)
 
 
-def test_a_workbook_is_read_with_names_and_units(tmp_path: Path) -> None:
+def test_a_workbook_is_read_with_names_and_units(tmp_path):
     book = openpyxl.Workbook()
     sheet = book.active
     sheet.append(["measured on Monday"])
@@ -344,7 +342,7 @@ def test_a_workbook_is_read_with_names_and_units(tmp_path: Path) -> None:
     assert_motor(read_records(tmp_path / "log.xlsx", MAP)["motor"])
 
 
-def test_of_a_workbook_the_longest_sheet_is_read(tmp_path: Path) -> None:
+def test_of_a_workbook_the_longest_sheet_is_read(tmp_path):
     book = openpyxl.Workbook()
     for row in (["sensor", "Hz", "ms"], ["gyro", 8000, 0.125], ["compass", 200, 5]):
         book.active.append(row)
@@ -386,12 +384,12 @@ ROS1 = ["voltage=/pwm.data velocity=/joint_states.velocity[right] clock=log"]
 
 
 @pytest.mark.parametrize("compression", [None, "BZ2", "LZ4"])
-def test_a_bag_of_ros_1_is_read_as_it_is(tmp_path: Path, compression: str | None) -> None:
+def test_a_bag_of_ros_1_is_read_as_it_is(tmp_path, compression):
     kind = None if compression is None else Writer.CompressionFormat[compression]
     assert_motor(read_records(ros1_bag(tmp_path / "old.bag", kind), ROS1)["motor"])
 
 
-def test_of_a_bag_of_ros_1_that_is_cut_off_the_rest_is_read(tmp_path: Path) -> None:
+def test_of_a_bag_of_ros_1_that_is_cut_off_the_rest_is_read(tmp_path):
     path = ros1_bag(tmp_path / "old.bag")
     whole = path.read_bytes()
     path.write_bytes(whole[: len(whole) * 2 // 5])
@@ -401,7 +399,7 @@ def test_of_a_bag_of_ros_1_that_is_cut_off_the_rest_is_read(tmp_path: Path) -> N
     assert any(f.code == "damaged_recording" for f in record.findings)
 
 
-def test_a_workbook_is_read_as_excel_shows_it(tmp_path: Path) -> None:
+def test_a_workbook_is_read_as_excel_shows_it(tmp_path):
     # ECMA-376, 18.8.30: a percentage shows a hundred times the stored value; times are
     # parts of a day
     book = openpyxl.Workbook()

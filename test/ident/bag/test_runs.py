@@ -51,9 +51,7 @@ def codes(record: Record) -> list[str]:
         pytest.param([run(60, 1), run(60, 2)], id="short ones"),
     ],
 )
-def test_runs_below_one_another_are_segments_of_their_own(
-    tmp_path: Path, parts: list[np.ndarray]
-) -> None:
+def test_runs_below_one_another_are_segments_of_their_own(tmp_path, parts):
     record = read(tmp_path / "log.csv", np.concatenate(parts))
     lengths = [len(part) for part in parts]
     assert record.starts == tuple(np.cumsum([0, *lengths])[:-1].tolist())
@@ -64,7 +62,7 @@ def test_runs_below_one_another_are_segments_of_their_own(
 
 
 @pytest.mark.parametrize("pause", [0.0, 60.0])
-def test_where_another_run_begins_no_voltage_is_answered(tmp_path: Path, pause: float) -> None:
+def test_where_another_run_begins_no_voltage_is_answered(tmp_path, pause):
     """Its first row has another voltage and another speed, and neither made the other."""
     parts = [run(600, 6 + k, k * pause, hold=100) for k in range(3)]
     record = read(tmp_path / "log.csv", np.concatenate(parts))
@@ -73,7 +71,7 @@ def test_where_another_run_begins_no_voltage_is_answered(tmp_path: Path, pause: 
 
 
 @pytest.mark.parametrize("slow", [60, 300])
-def test_runs_may_each_have_a_rate_of_their_own(tmp_path: Path, slow: int) -> None:
+def test_runs_may_each_have_a_rate_of_their_own(tmp_path, slow):
     rows = np.concatenate([run(600, 1), run(slow, 2) * [2, 1, 1]])
     record = read(tmp_path / "log.csv", rows)
     assert record.starts == (0, 600)
@@ -81,7 +79,7 @@ def test_runs_may_each_have_a_rate_of_their_own(tmp_path: Path, slow: int) -> No
     np.testing.assert_allclose(record.voltage[601:], rows[600:-1, 1], atol=1e-6)
 
 
-def test_a_run_that_was_cut_off_has_no_count_in_its_last_row(tmp_path: Path) -> None:
+def test_a_run_that_was_cut_off_has_no_count_in_its_last_row(tmp_path):
     parts = run(200, 1), run(300, 2)
     counts = [np.floor(50 * np.cumsum(STEP * part[:, 2])) for part in parts]
     lines = [
@@ -108,8 +106,8 @@ def test_a_run_that_was_cut_off_has_no_count_in_its_last_row(tmp_path: Path) -> 
     ],
 )
 def test_rows_of_several_motors_are_told_apart_by_a_column_that_names_them(
-    tmp_path: Path, order: str, column: str, names: tuple[str, str], motors: tuple[str, ...]
-) -> None:
+    tmp_path, order, column, names, motors
+):
     parts = [run(300, 1), run(300, 2)]
     rows = [(row, name) for part, name in zip(parts, names) for row in part]
     if order == "in turn":
@@ -124,12 +122,12 @@ def test_rows_of_several_motors_are_told_apart_by_a_column_that_names_them(
             assert "several_motors" in codes(records[name])
 
 
-def test_a_gap_that_the_user_allows_does_not_join_runs(tmp_path: Path) -> None:
+def test_a_gap_that_the_user_allows_does_not_join_runs(tmp_path):
     rows = np.concatenate([run(300, 1), run(300, 2)])
     assert read(tmp_path / "log.csv", rows, [*MAP, "gap=30"]).starts == (0, 300)
 
 
-def test_slow_samples_keep_their_runs_apart(tmp_path: Path) -> None:
+def test_slow_samples_keep_their_runs_apart(tmp_path):
     rows = np.concatenate([run(50, 1), run(50, 2)])
     rows[:, 0] *= 50  # two a second
     assert read(tmp_path / "log.csv", rows).starts == (0, 50)
@@ -160,7 +158,7 @@ def shuffled(rows: np.ndarray) -> np.ndarray:
         pytest.param(shuffled, id="shuffled"),
     ],
 )
-def test_rows_that_are_merely_out_of_order_are_sorted(tmp_path: Path, late: object) -> None:
+def test_rows_that_are_merely_out_of_order_are_sorted(tmp_path, late):
     rows = run(300, 4)
     record = read(tmp_path / "log.csv", late(rows))  # type: ignore[operator]
     np.testing.assert_allclose(record.velocity, rows[:, 2], atol=1e-6)
@@ -169,7 +167,7 @@ def test_rows_that_are_merely_out_of_order_are_sorted(tmp_path: Path, late: obje
     assert "clock_set_back" not in codes(record)
 
 
-def test_rows_that_are_there_twice_are_no_run_of_their_own(tmp_path: Path) -> None:
+def test_rows_that_are_there_twice_are_no_run_of_their_own(tmp_path):
     rows = run(300, 6)
     record = read(tmp_path / "log.csv", np.concatenate([rows[:200], rows[100:]]))
     np.testing.assert_allclose(record.velocity, rows[:, 2], atol=1e-6)
@@ -177,7 +175,7 @@ def test_rows_that_are_there_twice_are_no_run_of_their_own(tmp_path: Path) -> No
     assert "clock_set_back" not in codes(record)
 
 
-def test_rows_of_two_kinds_that_were_written_in_turn_are_no_runs() -> None:
+def test_rows_of_two_kinds_that_were_written_in_turn_are_no_runs():
     time = np.concatenate(
         [np.arange(50.0), np.arange(50.0), 50 + np.arange(50), 50 + np.arange(50)]
     )
@@ -186,7 +184,7 @@ def test_rows_of_two_kinds_that_were_written_in_turn_are_no_runs() -> None:
     assert split_into_runs(time, {"u": first, "w": second}) == [(0, 200)]
 
 
-def test_late_blocks_and_rows_do_not_hide_a_clock_that_starts_again() -> None:
+def test_late_blocks_and_rows_do_not_hide_a_clock_that_starts_again():
     """Each late block is held against what came since the last, so that many cost little."""
     blocks = np.arange(20_000.0).reshape(-1, 20)
     late = blocks.reshape(-1, 2, 20)[:, ::-1].ravel()
@@ -197,7 +195,7 @@ def test_late_blocks_and_rows_do_not_hide_a_clock_that_starts_again() -> None:
     assert split_into_runs(twice, {}) == [(0, 20_000), (20_000, 40_000), (40_000, 60_000)]
 
 
-def test_two_tables_of_one_clock_start_again_together(tmp_path: Path) -> None:
+def test_two_tables_of_one_clock_start_again_together(tmp_path):
     parts = [run(300, 1), run(300, 2)]
     rows = np.concatenate(parts)
     files = [
@@ -210,7 +208,7 @@ def test_two_tables_of_one_clock_start_again_together(tmp_path: Path) -> None:
     np.testing.assert_allclose(record.voltage[301:], rows[300:-1, 1], atol=1e-6)
 
 
-def test_two_tables_that_start_again_differently_are_refused(tmp_path: Path) -> None:
+def test_two_tables_that_start_again_differently_are_refused(tmp_path):
     rows = np.concatenate([run(300, 1), run(300, 2)])
     files = [
         write(tmp_path / "set.csv", run(600, 3)[:, :2], "t,u"),
@@ -220,14 +218,14 @@ def test_two_tables_that_start_again_differently_are_refused(tmp_path: Path) -> 
         read_records(files, ["voltage=/set.u velocity=/state.w time=t"])
 
 
-def test_files_of_several_runs_are_joined_with_others(tmp_path: Path) -> None:
+def test_files_of_several_runs_are_joined_with_others(tmp_path):
     two, one = np.concatenate([run(300, 1), run(300, 2)]), run(200, 3)
     paths = [write(tmp_path / "a.csv", two), write(tmp_path / "b.csv", one)]
     record = read_records(paths, MAP)["motor"]
     assert record.starts == (0, 300, 600)
 
 
-def test_several_runs_in_a_table_do_not_hide_the_voltage(tmp_path: Path) -> None:
+def test_several_runs_in_a_table_do_not_hide_the_voltage(tmp_path):
     rows = np.concatenate([run(300, k) for k in range(4)])
     path = write(tmp_path / "log.csv", rows)
     assert list_topics(path)[0].suggestion == ["voltage=u", "velocity=w", "time=t"]

@@ -55,7 +55,7 @@ def drawn(page_size: int, seed: int, count: int = 60) -> list[Row]:
 
 
 @pytest.mark.parametrize("page_size", [512, 1024, 4096, 65536])
-def test_every_row_that_sqlite_wrote_is_found_in_its_pages(tmp_path: Path, page_size: int) -> None:
+def test_every_row_that_sqlite_wrote_is_found_in_its_pages(tmp_path, page_size):
     path = tmp_path / "a.db3"
     # All numbers in both places, and rows of every length, that reach into other pages.
     rows = [(k + 1, a, b, b"x") for k, (a, b) in enumerate(zip(NUMBERS, NUMBERS[::-1]))]
@@ -64,7 +64,7 @@ def test_every_row_that_sqlite_wrote_is_found_in_its_pages(tmp_path: Path, page_
     assert sorted(salvaged(path)) == sorted(rows)
 
 
-def test_rows_of_other_tables_are_no_messages(tmp_path: Path) -> None:
+def test_rows_of_other_tables_are_no_messages(tmp_path):
     path = tmp_path / "a.db3"
     rows = [(k, 1, 10 * k, b"data") for k in range(1, 30)]
     others = (
@@ -88,7 +88,7 @@ def test_rows_of_other_tables_are_no_messages(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("page_size", [512, 4096])
-def test_whatever_is_cut_off_the_rows_of_whole_pages_remain(tmp_path: Path, page_size: int) -> None:
+def test_whatever_is_cut_off_the_rows_of_whole_pages_remain(tmp_path, page_size):
     path = tmp_path / "a.db3"
     rows = (
         drawn(page_size, 7) if page_size == 512 else [(k, 1, k, bytes(200)) for k in range(1, 99)]
@@ -106,7 +106,7 @@ def test_whatever_is_cut_off_the_rows_of_whole_pages_remain(tmp_path: Path, page
     assert last == 0
 
 
-def test_spoilt_numbers_cost_their_rows_alone_and_end(tmp_path: Path) -> None:
+def test_spoilt_numbers_cost_their_rows_alone_and_end(tmp_path):
     path = tmp_path / "a.db3"
     rows = [(k, 1, k, bytes([k]) * 90) for k in range(1, 100)]
     write(path, 512, rows)
@@ -121,7 +121,7 @@ def test_spoilt_numbers_cost_their_rows_alone_and_end(tmp_path: Path) -> None:
         assert len(salvaged(path)) >= len(rows) - 5 * 3, "a leaf holds five rows"
 
 
-def test_a_file_without_a_page_size_holds_nothing(tmp_path: Path) -> None:
+def test_a_file_without_a_page_size_holds_nothing(tmp_path):
     path = tmp_path / "a.db3"
     write(path, 512, [(1, 1, 1, b"x")])
     whole = bytearray(path.read_bytes())

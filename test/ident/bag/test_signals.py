@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import math
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -49,7 +48,7 @@ MAP = ["voltage=/pwm.data*12/255", "velocity=/joint_states.velocity[left_wheel_j
 
 
 @pytest.mark.parametrize("storage", ["mcap", "db3"])
-def test_pwm_counts_and_the_joint_of_a_name(tmp_path: Path, storage: str) -> None:
+def test_pwm_counts_and_the_joint_of_a_name(tmp_path, storage):
     n = 100
     rng = np.random.default_rng(0)
     pwm = rng.integers(-255, 256, n)
@@ -66,7 +65,7 @@ def test_pwm_counts_and_the_joint_of_a_name(tmp_path: Path, storage: str) -> Non
     np.testing.assert_allclose(record.voltage[1:], pwm[:-1] * 12 / 255, rtol=1e-15)
 
 
-def test_names_may_change_their_order_and_be_missing(tmp_path: Path) -> None:
+def test_names_may_change_their_order_and_be_missing(tmp_path):
     n = 90
     rng = np.random.default_rng(1)
     pwm = rng.integers(-255, 256, n)
@@ -88,7 +87,7 @@ def test_names_may_change_their_order_and_be_missing(tmp_path: Path) -> None:
     np.testing.assert_array_equal(record.velocity, left[np.arange(n) % 3 < 2])
 
 
-def test_a_topic_whose_every_message_is_laid_out_otherwise_is_read(tmp_path: Path) -> None:
+def test_a_topic_whose_every_message_is_laid_out_otherwise_is_read(tmp_path):
     n = 150
     values = np.random.default_rng(2).normal(size=n)
     messages = in_order(
@@ -107,7 +106,7 @@ def test_a_topic_whose_every_message_is_laid_out_otherwise_is_read(tmp_path: Pat
 
 
 @pytest.mark.parametrize("little", [True, False])
-def test_both_byte_orders_are_read(tmp_path: Path, little: bool) -> None:
+def test_both_byte_orders_are_read(tmp_path, little):
     truth = motion()
     messages = [
         Sent("/front_left/motor_state", STATE, int(t), truth.state(k, little))
@@ -165,7 +164,7 @@ REPORT_MAP = [
 ]
 
 
-def test_types_given_as_msg_files_are_used(tmp_path: Path) -> None:
+def test_types_given_as_msg_files_are_used(tmp_path):
     sent, values = reports(60)
     path = write_sqlite(tmp_path / "bag.db3", sent, schema=3)
     with pytest.raises(BagError, match=r"robot_msgs/msg/Report.*unknown.*\.msg files") as refused:
@@ -192,7 +191,7 @@ def test_types_given_as_msg_files_are_used(tmp_path: Path) -> None:
     np.testing.assert_array_equal(record.count, values[:, 1])
 
 
-def test_types_defined_in_the_bag_are_used(tmp_path: Path) -> None:
+def test_types_defined_in_the_bag_are_used(tmp_path):
     sent, values = reports(60)
     store = nested_store()
     text = store.generate_msgdef("robot_msgs/msg/Report", ros_version=2)[0]
@@ -213,7 +212,7 @@ def test_types_defined_in_the_bag_are_used(tmp_path: Path) -> None:
     assert {"wheels[0].speed", "wheels[1].ticks", "flags[2]", "raw[1]"} <= set(fields)
 
 
-def test_a_duty_cycle_times_the_supply_as_it_was_measured(tmp_path: Path) -> None:
+def test_a_duty_cycle_times_the_supply_as_it_was_measured(tmp_path):
     n = 50
     duty = np.linspace(-1, 1, n)
     supply = np.linspace(12.6, 11.4, n)
@@ -232,7 +231,7 @@ def test_a_duty_cycle_times_the_supply_as_it_was_measured(tmp_path: Path) -> Non
         read_records(path, ["voltage=/duty.data:duty velocity=/speed.data"])
 
 
-def test_units_scales_and_shafts_come_out_in_si_at_the_motor(tmp_path: Path) -> None:
+def test_units_scales_and_shafts_come_out_in_si_at_the_motor(tmp_path):
     messages = in_order(even("/u", [1.0] * 9), even("/w", [60.0] * 9))
     path = write_mcap(tmp_path / "bag.mcap", messages)
 
@@ -266,8 +265,8 @@ def test_units_scales_and_shafts_come_out_in_si_at_the_motor(tmp_path: Path) -> 
     ],
 )
 def test_a_mapping_that_does_not_fit_is_refused_with_the_available_fields(
-    tmp_path: Path, mapping: str, reason: str
-) -> None:
+    tmp_path, mapping, reason
+):
     messages = in_order(even("/u", [1.0] * 9), even("/w", [60.0] * 9))
     path = write_mcap(tmp_path / "bag.mcap", messages)
     with pytest.raises(BagError) as refused:
@@ -276,7 +275,7 @@ def test_a_mapping_that_does_not_fit_is_refused_with_the_available_fields(
     assert "bag.mcap" in str(refused.value)
 
 
-def test_messages_that_are_not_of_their_type_are_left_out_and_told(tmp_path: Path) -> None:
+def test_messages_that_are_not_of_their_type_are_left_out_and_told(tmp_path):
     truth = motion(n=100)
     messages = truth.messages()
     messages[50] = Sent(messages[50].topic, STATE, messages[50].stamp, b"\0\1\0\0rubbish")
@@ -286,7 +285,7 @@ def test_messages_that_are_not_of_their_type_are_left_out_and_told(tmp_path: Pat
     assert "2 messages are not of type smp_interfaces/msg/MotorState" in notes(record)
 
 
-def test_the_topics_of_a_bag_are_listed(tmp_path: Path) -> None:
+def test_the_topics_of_a_bag_are_listed(tmp_path):
     n = 30
     messages = in_order(
         even("/left/pwm", np.arange(n)),
@@ -304,7 +303,7 @@ def test_the_topics_of_a_bag_are_listed(tmp_path: Path) -> None:
     assert listing.suggestion == []  # no speed follows these voltages
 
 
-def test_our_own_messages_need_no_mapping(tmp_path: Path) -> None:
+def test_our_own_messages_need_no_mapping(tmp_path):
     path = write_mcap(tmp_path / "bag.mcap", motion(n=20, bits=16).messages())
     listing = list_topics(path)[0]
     assert not listing.needs_mapping
@@ -317,7 +316,7 @@ def test_our_own_messages_need_no_mapping(tmp_path: Path) -> None:
     assert (given.gear_ratio, given.resistance, given.encoder_bits) == (10.0, 1.5, 16)
 
 
-def test_a_missing_description_is_told(tmp_path: Path) -> None:
+def test_a_missing_description_is_told(tmp_path):
     messages = motion(n=20).messages(description=False)
     record = read_records(write_mcap(tmp_path / "bag.mcap", messages))["front_left"]
     assert "no motor_description; a gear ratio of 1 is assumed" in notes(record)

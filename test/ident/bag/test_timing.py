@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import dataclasses
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -44,9 +43,7 @@ def replaced(truth: Any, **changes: Any) -> Any:
 
 @MANY
 @given(data=st.data())
-def test_any_sequence_of_states_reads_back_as_it_was_written(
-    tmp_path_factory: pytest.TempPathFactory, data: st.DataObject
-) -> None:
+def test_any_sequence_of_states_reads_back_as_it_was_written(tmp_path_factory, data):
     n = data.draw(st.integers(2, 60))
     finite = st.floats(-1e12, 1e12)
     column = st.lists(finite, min_size=n, max_size=n).map(np.array)
@@ -68,11 +65,7 @@ def test_any_sequence_of_states_reads_back_as_it_was_written(
 
 @MANY
 @given(order=st.permutations(range(50)), storage=st.sampled_from(["mcap", "db3"]))
-def test_shuffled_samples_are_sorted_and_that_is_told(
-    tmp_path_factory: pytest.TempPathFactory,
-    order: list[int],
-    storage: str,
-) -> None:
+def test_shuffled_samples_are_sorted_and_that_is_told(tmp_path_factory, order, storage):
     truth = motion(n=50)
     messages = truth.messages(description=False)
     description = truth.messages()[:1]
@@ -85,9 +78,7 @@ def test_shuffled_samples_are_sorted_and_that_is_told(
     assert ("out of order" in notes(record)) is shuffled
 
 
-def test_a_mean_voltage_over_a_long_interval_of_irregular_samples_begins_a_segment(
-    tmp_path: Path,
-) -> None:
+def test_a_mean_voltage_over_a_long_interval_of_irregular_samples_begins_a_segment(tmp_path):
     """The mean does not tell when within 0.4 s, where 10 ms are usual, the voltage changed."""
     truth = motion(n=200)
     steps = np.where(np.arange(200) % 3, 10_000_000, 19_000_000)
@@ -98,7 +89,7 @@ def test_a_mean_voltage_over_a_long_interval_of_irregular_samples_begins_a_segme
     assert "1 gaps of up to 0.4 s" in notes(record)
 
 
-def test_a_few_lost_samples_are_bridged_and_more_begin_a_segment(tmp_path: Path) -> None:
+def test_a_few_lost_samples_are_bridged_and_more_begin_a_segment(tmp_path):
     truth = motion(n=400)
     ramp = np.linspace(-10, 10, 400)
     truth = replaced(truth, voltage=ramp)
@@ -120,7 +111,7 @@ def test_a_few_lost_samples_are_bridged_and_more_begin_a_segment(tmp_path: Path)
     np.testing.assert_array_equal(record.voltage[untouched], ramp[kept][untouched])
 
 
-def test_late_samples_are_not_taken_for_lost_ones(tmp_path: Path) -> None:
+def test_late_samples_are_not_taken_for_lost_ones(tmp_path):
     truth = motion(n=400)
     time = truth.time.copy()
     # A stall of four periods, after which the sampler catches up in a burst.
@@ -133,7 +124,7 @@ def test_late_samples_are_not_taken_for_lost_ones(tmp_path: Path) -> None:
     assert "missing" not in notes(record)
 
 
-def test_duplicates_are_left_out_and_told(tmp_path: Path) -> None:
+def test_duplicates_are_left_out_and_told(tmp_path):
     truth = motion(n=100)
     messages = truth.messages()
     record = read(tmp_path / "bag.mcap", [*messages, *messages[40:60]])
@@ -141,7 +132,7 @@ def test_duplicates_are_left_out_and_told(tmp_path: Path) -> None:
     assert "20 samples with a repeated time were left out (duplicates)" in notes(record)
 
 
-def test_samples_without_a_voltage_are_left_out_and_told(tmp_path: Path) -> None:
+def test_samples_without_a_voltage_are_left_out_and_told(tmp_path):
     truth = motion(n=100)
     voltage, current = truth.voltage.copy(), np.full(100, np.nan)
     voltage[[10, 40]] = np.nan, np.inf
@@ -157,9 +148,7 @@ def test_samples_without_a_voltage_are_left_out_and_told(tmp_path: Path) -> None
 
 
 @pytest.mark.parametrize("days", [0, 3, -3])
-def test_header_stamps_days_away_from_the_log_are_used_and_that_is_told(
-    tmp_path: Path, days: int
-) -> None:
+def test_header_stamps_days_away_from_the_log_are_used_and_that_is_told(tmp_path, days):
     truth = motion(n=100)
     record = read(tmp_path / "bag.mcap", truth.messages(latency=days * 86_400 * 10**9 + 7))
     assert_read(record, truth)
@@ -167,7 +156,7 @@ def test_header_stamps_days_away_from_the_log_are_used_and_that_is_told(
     assert (f"{days * 86400:+d}.000000 s from the header's" in notes(record)) is bool(days)
 
 
-def test_stamps_that_are_not_set_are_not_the_time(tmp_path: Path) -> None:
+def test_stamps_that_are_not_set_are_not_the_time(tmp_path):
     truth = motion(n=100)
     unset = replaced(truth, time=np.zeros(100, np.int64))
     messages = [
@@ -179,7 +168,7 @@ def test_stamps_that_are_not_set_are_not_the_time(tmp_path: Path) -> None:
     assert "time: log times (the header stamps are not set)" in notes(record)
 
 
-def test_a_clock_that_was_set_back_begins_a_new_segment(tmp_path: Path) -> None:
+def test_a_clock_that_was_set_back_begins_a_new_segment(tmp_path):
     truth = motion(n=200)
     stamps = truth.time.copy()
     stamps[100:] -= 3_600 * 10**9
@@ -193,7 +182,7 @@ def test_a_clock_that_was_set_back_begins_a_new_segment(tmp_path: Path) -> None:
     assert "set back 1 times" in notes(record)
 
 
-def test_a_stamped_output_meets_an_unstamped_input_by_offset_and_drift(tmp_path: Path) -> None:
+def test_a_stamped_output_meets_an_unstamped_input_by_offset_and_drift(tmp_path):
     rng = np.random.default_rng(5)
     n, drift, offset = 3000, 50e-6, 12_345.678
     sampled = np.arange(n) * 0.01  # the microcontroller's clock
@@ -220,7 +209,7 @@ def test_a_stamped_output_meets_an_unstamped_input_by_offset_and_drift(tmp_path:
     assert lag.max() < 0.005 + 0.02 + 0.001
 
 
-def test_offset_and_drift_are_found_below_the_latency() -> None:
+def test_offset_and_drift_are_found_below_the_latency():
     rng = np.random.default_rng(6)
     stamp = np.arange(60_000, dtype=np.int64) * 1_000_000
     latency = rng.exponential(2_000_000, stamp.size).astype(np.int64)
@@ -233,7 +222,7 @@ def test_offset_and_drift_are_found_below_the_latency() -> None:
 
 @MANY
 @given(data=st.data(), held=st.sampled_from(["after", "before"]))
-def test_a_held_input_is_averaged_over_each_interval(data: st.DataObject, held: str) -> None:
+def test_a_held_input_is_averaged_over_each_interval(data, held):
     increasing = st.sets(st.integers(0, 1000), min_size=2, max_size=30).map(sorted)
     time = np.array(data.draw(increasing), np.int64) * 1_000_000
     value = np.array([data.draw(st.floats(-10, 10)) for _ in time])
@@ -254,7 +243,7 @@ def test_a_held_input_is_averaged_over_each_interval(data: st.DataObject, held: 
         assert found[k] == pytest.approx(level[inside].mean(), abs=1e-9)
 
 
-def test_samples_before_the_first_command_are_left_out(tmp_path: Path) -> None:
+def test_samples_before_the_first_command_are_left_out(tmp_path):
     times = START + np.arange(100) * 10_000_000
     messages = in_order(floats("/w", times, np.arange(100)), floats("/u", times[30:], np.ones(70)))
     record = read(tmp_path / "bag.mcap", messages, "voltage=/u.data velocity=/w.data")
@@ -262,7 +251,7 @@ def test_samples_before_the_first_command_are_left_out(tmp_path: Path) -> None:
     assert "30 samples before the first voltage were left out" in notes(record)
 
 
-def test_an_input_that_stops_ends_the_record_there(tmp_path: Path) -> None:
+def test_an_input_that_stops_ends_the_record_there(tmp_path):
     times = START + np.arange(200) * 10_000_000
     on = np.r_[0:60, 140:200]
     messages = in_order(floats("/w", times, np.arange(200)), floats("/u", times[on], np.ones(120)))
@@ -271,7 +260,7 @@ def test_an_input_that_stops_ends_the_record_there(tmp_path: Path) -> None:
     assert len(record.starts) == 2
 
 
-def test_outputs_of_several_topics_come_onto_one_axis(tmp_path: Path) -> None:
+def test_outputs_of_several_topics_come_onto_one_axis(tmp_path):
     fast = START + np.arange(400) * 5_000_000
     slow = START + np.arange(200) * 10_000_000 + 1_000_000
     messages = in_order(
@@ -290,7 +279,7 @@ def test_outputs_of_several_topics_come_onto_one_axis(tmp_path: Path) -> None:
     assert "velocity: interpolated" in notes(record)
 
 
-def test_an_angle_that_wraps_at_a_turn_is_unwrapped(tmp_path: Path) -> None:
+def test_an_angle_that_wraps_at_a_turn_is_unwrapped(tmp_path):
     times = START + np.arange(300) * 10_000_000
     angle = np.arange(300) * 7.0
     messages = in_order(floats("/u", times, np.ones(300)), floats("/angle", times, angle % 360))
@@ -299,7 +288,7 @@ def test_an_angle_that_wraps_at_a_turn_is_unwrapped(tmp_path: Path) -> None:
     assert "wraps at one turn" in notes(record)
 
 
-def test_recordings_of_different_gearboxes_are_not_joined(tmp_path: Path) -> None:
+def test_recordings_of_different_gearboxes_are_not_joined(tmp_path):
     record = read(tmp_path / "bag.mcap", motion(n=20).messages())
     other = dataclasses.replace(
         record, hardware=dataclasses.replace(record.hardware, gear_ratio=1.0)
@@ -308,7 +297,7 @@ def test_recordings_of_different_gearboxes_are_not_joined(tmp_path: Path) -> Non
         join_records([record, other])
 
 
-def test_signals_of_only_some_recordings_are_kept_there(tmp_path: Path) -> None:
+def test_signals_of_only_some_recordings_are_kept_there(tmp_path):
     record = read(tmp_path / "bag.mcap", motion(n=20).messages())
     other = dataclasses.replace(record, current=None)
     joined = join_records([record, other])
@@ -317,7 +306,7 @@ def test_signals_of_only_some_recordings_are_kept_there(tmp_path: Path) -> None:
     assert np.all(np.diff(joined.time) > 0)
 
 
-def test_a_recording_knows_when_it_began_where_its_clock_was_set(tmp_path: Path) -> None:
+def test_a_recording_knows_when_it_began_where_its_clock_was_set(tmp_path):
     truth = motion()
     (record,) = read_records(write_mcap(tmp_path / "a.mcap", truth.messages())).values()
     assert record.recorded == pytest.approx(1e-9 * START, abs=1.0)
@@ -328,9 +317,7 @@ def test_a_recording_knows_when_it_began_where_its_clock_was_set(tmp_path: Path)
 
 
 @pytest.mark.parametrize("years", [0.01, 1.0, 56.0])
-def test_a_clock_that_is_set_forward_begins_a_segment_and_costs_no_time(
-    tmp_path: Path, years: float
-) -> None:
+def test_a_clock_that_is_set_forward_begins_a_segment_and_costs_no_time(tmp_path, years):
     truth = motion(n=400)
     leap = round(years * 365.25 * 86_400) * 10**9
     time = truth.time - START
@@ -343,7 +330,7 @@ def test_a_clock_that_is_set_forward_begins_a_segment_and_costs_no_time(
     assert found.evidence["longest"] == pytest.approx(leap * 1e-9, rel=1e-6)
 
 
-def test_offsets_between_topics_are_kept_where_the_clock_is_set(tmp_path: Path) -> None:
+def test_offsets_between_topics_are_kept_where_the_clock_is_set(tmp_path):
     k, leap = np.arange(400), 10**18
     at = START + 10**7 * k + leap * (k >= 200)
     sent = in_order(floats("/u", at, k // 20 % 3), floats("/w", at, np.sin(0.1 * k)))

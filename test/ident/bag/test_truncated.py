@@ -61,22 +61,20 @@ def assert_every_cut_is_sound(whole: bytes, path: Path, samples: int, most_lost:
         (dict(compression=mcap.writer.CompressionType.LZ4), 60),
     ],
 )
-def test_an_mcap_file_cut_at_every_kilobyte(
-    tmp_path: Path, options: dict[str, object], most_lost: int
-) -> None:
+def test_an_mcap_file_cut_at_every_kilobyte(tmp_path, options, most_lost):
     truth = motion(n=400)
     path = write_mcap(tmp_path / "bag.mcap", truth.messages(), **options)
     assert_every_cut_is_sound(path.read_bytes(), path, 400, most_lost)
 
 
-def test_a_sqlite_file_cut_at_every_kilobyte(tmp_path: Path) -> None:
+def test_a_sqlite_file_cut_at_every_kilobyte(tmp_path):
     truth = motion(n=400)
     path = write_sqlite(tmp_path / "bag.db3", truth.messages())
     # The first seven of its twenty pages hold no messages: by the bytes, those of 140.
     assert_every_cut_is_sound(path.read_bytes(), path, 400, 140)
 
 
-def test_rows_that_are_out_of_order_are_not_read_for_ever(tmp_path: Path) -> None:
+def test_rows_that_are_out_of_order_are_not_read_for_ever(tmp_path):
     path = write_sqlite(tmp_path / "bag.db3", motion(n=400).messages())
     database = sqlite3.connect(path)
     last = max(database.execute("SELECT max(id) FROM messages").fetchone())
@@ -95,9 +93,7 @@ def test_rows_that_are_out_of_order_are_not_read_for_ever(tmp_path: Path) -> Non
 
 @pytest.mark.parametrize("pack", [zstd.compress, lz4.frame.compress])
 @pytest.mark.parametrize("storage", ["mcap", "db3"])
-def test_a_compressed_file_cut_at_every_kilobyte(
-    tmp_path: Path, storage: str, pack: object
-) -> None:
+def test_a_compressed_file_cut_at_every_kilobyte(tmp_path, storage, pack):
     truth = motion(n=400)
     write = write_mcap if storage == "mcap" else write_sqlite
     plain = write(tmp_path / f"bag.{storage}", truth.messages())
@@ -107,7 +103,7 @@ def test_a_compressed_file_cut_at_every_kilobyte(
     assert_every_cut_is_sound(pack(plain.read_bytes()), path, 400, 400)
 
 
-def test_a_cut_bag_reports_its_share_of_the_declared_messages(tmp_path: Path) -> None:
+def test_a_cut_bag_reports_its_share_of_the_declared_messages(tmp_path):
     truth = motion(n=400)
     bag = tmp_path / "bag"
     bag.mkdir()
@@ -120,7 +116,7 @@ def test_a_cut_bag_reports_its_share_of_the_declared_messages(tmp_path: Path) ->
     assert_read(read_records(bag)["front_left"], truth, count)
 
 
-def test_a_damaged_chunk_costs_only_itself(tmp_path: Path) -> None:
+def test_a_damaged_chunk_costs_only_itself(tmp_path):
     truth = motion(n=400)
     path = write_mcap(tmp_path / "bag.mcap", truth.messages())
     data = bytearray(path.read_bytes())
@@ -133,7 +129,7 @@ def test_a_damaged_chunk_costs_only_itself(tmp_path: Path) -> None:
     assert f"{count} of 400 messages" in words
 
 
-def test_a_tail_of_zeros_is_not_a_message(tmp_path: Path) -> None:
+def test_a_tail_of_zeros_is_not_a_message(tmp_path):
     truth = motion(n=400)
     path = write_mcap(tmp_path / "bag.mcap", truth.messages(), use_chunking=False)
     data = path.read_bytes()
@@ -146,7 +142,7 @@ def test_a_tail_of_zeros_is_not_a_message(tmp_path: Path) -> None:
     np.testing.assert_array_equal(record.voltage[:-1], truth.voltage[: count - 1])
 
 
-def test_a_writer_that_was_killed_leaves_a_bag_that_everybody_reads(tmp_path: Path) -> None:
+def test_a_writer_that_was_killed_leaves_a_bag_that_everybody_reads(tmp_path):
     from rosbags.highlevel import AnyReader
 
     truth = motion(n=300)

@@ -8,7 +8,6 @@ import math
 import random
 from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
 
 import lz4.frame
 import numpy as np
@@ -42,7 +41,7 @@ def budget(monkeypatch: pytest.MonkeyPatch) -> Budget:
 
 
 @pytest.mark.parametrize("kind", PACK)
-def test_all_frames_of_a_block_are_unpacked_and_counted(kind, budget) -> None:
+def test_all_frames_of_a_block_are_unpacked_and_counted(kind, budget):
     one, many = PACK[kind](PLAIN), b"".join(PACK[kind](part) for part in PARTS)
     for packed in (one, many):
         before = budget.left
@@ -52,7 +51,7 @@ def test_all_frames_of_a_block_are_unpacked_and_counted(kind, budget) -> None:
 
 
 @pytest.mark.parametrize("kind", PACK)
-def test_frames_come_out_whole_whatever_the_blocks_they_are_read_in(kind) -> None:
+def test_frames_come_out_whole_whatever_the_blocks_they_are_read_in(kind):
     packed = b"".join(PACK[kind](part) for part in PARTS)
     for length in (1, 7, 1023, 1024, 1025, 1 << 16):
         if length == 1 and kind == "bz2":
@@ -69,7 +68,7 @@ def test_frames_come_out_whole_whatever_the_blocks_they_are_read_in(kind) -> Non
 
 
 @pytest.mark.parametrize("kind", PACK)
-def test_the_part_of_a_block_before_its_cut_is_kept(kind, budget) -> None:
+def test_the_part_of_a_block_before_its_cut_is_kept(kind, budget):
     packed = PACK[kind](PARTS[0]) + PACK[kind](PARTS[1])[:-300]
     kept = decompress(packed, kind, budget)
     assert PLAIN.startswith(kept) and len(kept) >= len(PARTS[0])
@@ -80,7 +79,7 @@ def test_the_part_of_a_block_before_its_cut_is_kept(kind, budget) -> None:
     assert decompress(b"no frame at all", kind, budget) == b""
 
 
-def test_an_unknown_compression_is_named(budget) -> None:
+def test_an_unknown_compression_is_named(budget):
     with pytest.raises(BagError, match="'snappy' is not supported; use zstd, lz4 or bz2"):
         decompress(b"", "snappy", budget)
 
@@ -101,7 +100,7 @@ def test_the_limit_follows_from_the_size_or_from_the_user(given, limit, monkeypa
             Budget("a.mcap", 1)
 
 
-def test_the_limit_itself_may_be_taken_and_not_a_byte_more(monkeypatch) -> None:
+def test_the_limit_itself_may_be_taken_and_not_a_byte_more(monkeypatch):
     monkeypatch.setenv("SMP_BAG_UNPACKED", "3000000")
     budget = Budget("a.mcap", 1)
     budget.take(2_999_999)
@@ -116,7 +115,7 @@ def test_the_limit_itself_may_be_taken_and_not_a_byte_more(monkeypatch) -> None:
 
 
 @pytest.mark.parametrize("kind", PACK)
-def test_a_file_is_unpacked_and_damage_is_reported(kind, budget, tmp_path: Path) -> None:
+def test_a_file_is_unpacked_and_damage_is_reported(kind, budget, tmp_path):
     path, plain = tmp_path / "a.mcap.x", tmp_path / "a.mcap"
     path.write_bytes(b"".join(map(PACK[kind], PARTS)))
     assert unpack_file(path, plain, kind, budget) == ""
@@ -131,7 +130,7 @@ def test_a_file_is_unpacked_and_damage_is_reported(kind, budget, tmp_path: Path)
         unpack_file(tmp_path / "none", plain, kind, budget)
 
 
-def test_messages_that_were_packed_one_by_one_are_unpacked_and_the_lost_counted(budget) -> None:
+def test_messages_that_were_packed_one_by_one_are_unpacked_and_the_lost_counted(budget):
     channel = Channel(1, "/a", "std_msgs/msg/String")
     blobs = [b"", b"abc", b"plain and long", zstd.compress(b"one" * 50),
              lz4.frame.compress(b"two" * 50), zstd.compress(b"three" * 50)[:9],

@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -67,7 +66,7 @@ TABLES: dict[str, tuple[str, str, str]] = {
 
 
 @pytest.mark.parametrize("name", list(TABLES))
-def test_a_table_of_the_world_is_read(tmp_path: Path, name: str) -> None:
+def test_a_table_of_the_world_is_read(tmp_path, name):
     content, mapping, code = TABLES[name]
     (tmp_path / "log.csv").write_text(content)
     record = read_records(tmp_path / "log.csv", [mapping])["motor"]
@@ -80,7 +79,7 @@ def test_a_table_of_the_world_is_read(tmp_path: Path, name: str) -> None:
     )
 
 
-def test_set_and_state_in_two_files_are_one_recording_on_their_clocks(tmp_path: Path) -> None:
+def test_set_and_state_in_two_files_are_one_recording_on_their_clocks(tmp_path):
     (tmp_path / "set.csv").write_text(
         text([f"{t:.3f},{u!r}" for t, u in zip(T, U.tolist())], "t,u")
     )
@@ -94,14 +93,14 @@ def test_set_and_state_in_two_files_are_one_recording_on_their_clocks(tmp_path: 
     np.testing.assert_allclose(record.voltage[1:], 0.6 * U[:-1] + 0.4 * U[1:], rtol=1e-6)
 
 
-def test_a_file_with_more_words_than_rows_is_refused_by_its_line(tmp_path: Path) -> None:
+def test_a_file_with_more_words_than_rows_is_refused_by_its_line(tmp_path):
     lines = [line if k % 10 else "Brown-out!" for k, line in enumerate(rows())]
     (tmp_path / "log.csv").write_text(text(lines))
     with pytest.raises(BagError, match="line 12, column 't': 'Brown-out!' is not a number"):
         read_records(tmp_path / "log.csv", [MAP])
 
 
-def test_a_record_whose_first_row_is_the_step_keeps_it(tmp_path: Path) -> None:
+def test_a_record_whose_first_row_is_the_step_keeps_it(tmp_path):
     lines = [f"{t:.2f},6,{60 * (1 - np.exp(-t / 0.1)):.6f}" for t in T]
     (tmp_path / "log.csv").write_text(text(lines))
     record = read_records(tmp_path / "log.csv", [MAP])["motor"]

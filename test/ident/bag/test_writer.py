@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import threading
 import tracemalloc
-from pathlib import Path
 
 import pytest
 import yaml
@@ -25,7 +24,7 @@ def float_bytes(value: float) -> bytes:
     return data
 
 
-def test_metadata_are_those_of_version_nine(tmp_path: Path) -> None:
+def test_metadata_are_those_of_version_nine(tmp_path):
     with BagWriter(tmp_path / "bag") as bag:
         bag.add_topic("/b", FLOAT, [{"reliability": "best_effort", "depth": 7}])
         bag.write("/a", FLOAT, float_bytes(1.0), 1_000)
@@ -52,7 +51,7 @@ def test_metadata_are_those_of_version_nine(tmp_path: Path) -> None:
     assert topics["/a"]["topic_metadata"]["type_description_hash"] == expected
 
 
-def test_the_file_is_indexed_and_checked_by_the_mcap_library(tmp_path: Path) -> None:
+def test_the_file_is_indexed_and_checked_by_the_mcap_library(tmp_path):
     with BagWriter(tmp_path / "bag") as bag:
         for k in range(100):
             bag.write("/a", FLOAT, float_bytes(k), 1_000 + k)
@@ -72,7 +71,7 @@ def test_the_file_is_indexed_and_checked_by_the_mcap_library(tmp_path: Path) -> 
     assert b"float64 data" in schema.data
 
 
-def test_every_flush_leaves_a_whole_bag(tmp_path: Path) -> None:
+def test_every_flush_leaves_a_whole_bag(tmp_path):
     bag = BagWriter(tmp_path / "bag")
     for k in range(30):
         bag.write(f"/t{k % 3}", FLOAT, float_bytes(k), 1_000 + k)
@@ -87,7 +86,7 @@ def test_every_flush_leaves_a_whole_bag(tmp_path: Path) -> None:
         bag.write("/t0", FLOAT, b"", 1)
 
 
-def test_a_bag_is_never_overwritten(tmp_path: Path) -> None:
+def test_a_bag_is_never_overwritten(tmp_path):
     with BagWriter(tmp_path / "bag"):
         pass
     with pytest.raises(BagError, match="exists already"):
@@ -97,7 +96,7 @@ def test_a_bag_is_never_overwritten(tmp_path: Path) -> None:
         BagWriter(tmp_path / "file" / "bag")
 
 
-def test_a_bag_without_messages_is_whole(tmp_path: Path) -> None:
+def test_a_bag_without_messages_is_whole(tmp_path):
     with BagWriter(tmp_path / "bag") as bag:
         bag.add_topic("/a", FLOAT)
     with AnyReader([tmp_path / "bag"]) as reader:
@@ -106,7 +105,7 @@ def test_a_bag_without_messages_is_whole(tmp_path: Path) -> None:
     assert list(Replay(tmp_path / "bag").messages()) == []
 
 
-def test_an_unknown_type_is_kept_without_its_definition(tmp_path: Path) -> None:
+def test_an_unknown_type_is_kept_without_its_definition(tmp_path):
     with BagWriter(tmp_path / "bag") as bag:
         assert not bag.add_topic("/odd", "strange_msgs/msg/Thing")
         assert bag.add_topic("/a", FLOAT)
@@ -114,7 +113,7 @@ def test_an_unknown_type_is_kept_without_its_definition(tmp_path: Path) -> None:
     assert [data for _, _, data in Replay(tmp_path / "bag").messages()] == [b"12345678"]
 
 
-def test_many_threads_may_write(tmp_path: Path) -> None:
+def test_many_threads_may_write(tmp_path):
     data = float_bytes(1.0)
     with BagWriter(tmp_path / "bag", flush_period=0.001) as bag:
 
@@ -132,7 +131,7 @@ def test_many_threads_may_write(tmp_path: Path) -> None:
         assert sum(1 for _ in reader.messages()) == 2000
 
 
-def test_replay_gives_messages_in_order_over_chunks_and_files(tmp_path: Path) -> None:
+def test_replay_gives_messages_in_order_over_chunks_and_files(tmp_path):
     with BagWriter(tmp_path / "bag") as bag:
         for k in range(200):
             # Within a chunk of ten, and from chunk to chunk, stamps come a little out of order.
@@ -156,14 +155,14 @@ def test_replay_gives_messages_in_order_over_chunks_and_files(tmp_path: Path) ->
         ("17", (True, False)),
     ],
 )
-def test_recorded_qos_of_every_version_is_understood(qos: str, expected: tuple[bool, bool]) -> None:
+def test_recorded_qos_of_every_version_is_understood(qos, expected):
     from smp_motor_ident.bag.storage import Channel
 
     assert find_offered_qos(Channel(1, "/a", FLOAT, qos=qos)) == expected
 
 
 @pytest.mark.parametrize("storage", ["mcap", "db3"])
-def test_unmapped_topics_take_no_memory(tmp_path: Path, storage: str) -> None:
+def test_unmapped_topics_take_no_memory(tmp_path, storage):
     truth = motion(n=500)
     image = bytes(200_000)
     images = [
