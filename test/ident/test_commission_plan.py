@@ -84,6 +84,7 @@ class Steps:
 
     def __init__(self, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         self.folder, self.done = folder, list[str]()
+        self.given = ["--output", str(folder), "--yes"]
         self.cut, self.fuel = "", 100  # moves that a run completes before it is cut off
         self.left = 0
         self.found, self.heat = tuple[Finding, ...](), list[Finding]()
@@ -152,38 +153,36 @@ def robot(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Steps:
 
 
 def test_an_interrupted_commissioning_sends_the_same_commands(robot):
-    given = ["--output", str(robot.folder), "--yes"]
     robot.more = plan.Recording("excitation", "further", steps.Excitation("fourier", 9.0, 5.0))
-    assert main([*given, "--amplitude", "5", "--duration", "2"]) == 0
+    assert main([*robot.given, "--amplitude", "5", "--duration", "2"]) == 0
     moved = ["check", *["excite"] * 4, "identify", "excite", "identify"]
     assert robot.done == [*moved, "validate", "tune", "verify"]
     sent, robot.sent, robot.fuel = robot.sent, [], 1
     shutil.rmtree(robot.folder)
-    assert main([*given, "--amplitude", "5", "--duration", "2"]) == 130
+    assert main([*robot.given, "--amplitude", "5", "--duration", "2"]) == 130
     runs = 1
-    while main([*given, "--resume"]) == 130:  # each does one part more
+    while main([*robot.given, "--resume"]) == 130:  # each does one part more
         runs += 1
     assert runs == 5 and robot.sent == sent
     # Recordings at different voltages are not mixed.
     robot.fuel = 100
-    assert main([*given, "--resume", "--amplitude", "8"]) == 0
+    assert main([*robot.given, "--resume", "--amplitude", "8"]) == 0
     assert len(robot.sent) == 2 * len(sent)
 
 
 def test_interrupted_motion_is_repeated_and_completed_motion_is_not(tmp_path, robot):
-    given = ["--output", str(robot.folder), "--yes"]
     other = tmp_path / "other"
     other.mkdir()
     (other / "diary").touch()
     assert main(["--output", str(other), "--yes", "--resume"]) == 2  # nothing of ours
     assert (other / "diary").exists()
     robot.cut = "excite"
-    assert main(given) == 130
-    assert main(given) == 2  # a folder that is there is not overwritten unasked
+    assert main(robot.given) == 130
+    assert main(robot.given) == 2  # a folder that is there is not overwritten unasked
     robot.cut = "identify"
-    assert main([*given, "--resume"]) == 130
+    assert main([*robot.given, "--resume"]) == 130
     robot.cut = ""
-    assert main([*given, "--resume"]) == 0
+    assert main([*robot.given, "--resume"]) == 0
     # Cut off in the first signal; then in identify after all four; then no wheel moves again.
     ended = ["identify", "validate", "tune", "verify"]
     assert robot.done == ["check", "excite", *["excite"] * 4, "identify", *ended]
@@ -192,26 +191,24 @@ def test_interrupted_motion_is_repeated_and_completed_motion_is_not(tmp_path, ro
 
 
 def test_a_drive_that_failed_is_driven_again_and_nothing_else_is_done_again(robot):
-    given = ["--output", str(robot.folder), "--yes"]
     robot.cut = "verify"
-    assert main(given) == 130
+    assert main(robot.given) == 130
     assert robot.done[-4:] == ["identify", "validate", "tune", "verify"]
     robot.done, robot.cut = [], ""
-    assert main([*given, "--resume"]) == 0
+    assert main([*robot.given, "--resume"]) == 0
     assert robot.done == ["verify"]
     # A recording that is missing is made again, and what follows from it.
     robot.done = []
     shutil.rmtree(robot.folder / "excitation" / "sine")
-    assert main([*given, "--resume"]) == 0
+    assert main([*robot.given, "--resume"]) == 0
     assert robot.done == ["excite", "identify", "validate", "tune", "verify"]
 
 
 def test_a_drive_alone_is_asked_for_too(robot, capsys):
-    given = ["--output", str(robot.folder)]
     robot.cut = "verify"
-    assert main([*given, "--yes"]) == 130
+    assert main(robot.given) == 130
     robot.done, robot.cut = [], ""
-    assert main([*given, "--resume"]) == 2
+    assert main([*robot.given[:2], "--resume"]) == 2
     assert "--yes" in capsys.readouterr().err and robot.done == []
 
 
@@ -219,10 +216,9 @@ def test_gains_that_no_controller_could_keep_are_refused_before_anything_moves(
     robot, capsys, monkeypatch
 ):
     monkeypatch.setattr(Client, "controlled", False)
-    given = ["--output", str(robot.folder), "--yes"]
-    assert main([*given, "--apply"]) == 2
+    assert main([*robot.given, "--apply"]) == 2
     assert "no wheel_pid runs for left" in capsys.readouterr().err and robot.done == []
-    assert main(given) == 0
+    assert main(robot.given) == 0
     told = capsys.readouterr().out
     assert "no wheel_pid runs for left: one is started" in told
     # It is said before the first wheel moves.
@@ -235,39 +231,36 @@ def test_an_unreliable_motor_is_designed_on_only_where_that_is_accepted(robot, m
     tuned = list[str]()
     tune = robot.tune
     monkeypatch.setattr(steps, "tune_wheels", lambda *given: (tuned.extend(given[2:]), tune()))
-    given = ["--output", str(robot.folder), "--yes"]
-    assert main(given) == 1
+    assert main(robot.given) == 1
     page = (robot.folder / "report.html").read_text()
     assert "the gain may be off" in page and "Not passed." in page
     robot.done = []
-    assert main([*given, "--resume", "--accept", "unreliable_identification"]) == 0
+    assert main([*robot.given, "--resume", "--accept", "unreliable_identification"]) == 0
     assert robot.done == ["tune", "verify"] and "--accept-unreliable" in tuned
     assert "Passed with accepted findings." in (robot.folder / "report.html").read_text()
 
 
 def test_a_wrong_wire_stops_before_the_excitation_unless_it_is_accepted(robot, capsys):
     robot.found = (STOP,)
-    given = ["--output", str(robot.folder), "--yes"]
-    assert main(given) == 1
+    assert main(robot.given) == 1
     said = capsys.readouterr().err
     assert STOP.message in said and STOP.advice in said
     assert robot.done == ["check"]
     page = (robot.folder / "report.html").read_text()
     assert "Not passed." in page and STOP.message in page and STOP.advice in page
     # The wire is mended, or it is so on purpose: the same folder goes on.
-    assert main([*given, "--resume", "--accept", "reversed"]) == 0
+    assert main([*robot.given, "--resume", "--accept", "reversed"]) == 0
     page = (robot.folder / "report.html").read_text()
     assert "Passed with accepted findings." in page
 
 
 def test_a_hot_winding_ends_it_before_the_next_signal_and_goes_on_when_it_is_cool(robot):
-    given = ["--output", str(robot.folder), "--yes"]
     robot.heat = [Finding("winding_hot", "refused", "left: 60 K hotter", {"wheel": "left"}, "wait")]
-    assert main(given) != 0
+    assert main(robot.given) != 0
     assert robot.done == ["check", "excite"]
     assert "60 K hotter" in (robot.folder / "report.html").read_text()
     robot.heat = []
-    assert main([*given, "--resume"]) == 0
+    assert main([*robot.given, "--resume"]) == 0
     assert robot.done.count("excite") == 4
 
 
@@ -276,20 +269,19 @@ def test_the_reason_of_an_abnormal_end_is_on_the_page(robot, monkeypatch):
         raise ProcessError("left/wheel_pid refused the parameters")
 
     monkeypatch.setattr(steps, "tune_wheels", refuse)
-    assert main(["--output", str(robot.folder), "--yes"]) == 1
+    assert main(robot.given) == 1
     document = json.loads((robot.folder / "commissioning.json").read_text())
     assert document["passed"] is False and "refused the parameters" in document["verdict"]
 
 
 def test_a_wheel_that_turns_faster_than_its_checks_or_its_limit_ends_the_excitation(robot):
-    given = ["--output", str(robot.folder), "--yes"]
-    assert main(given) == 0
+    assert main(robot.given) == 0
     # The checks show 1.6 rad/s; half as much again is no supply's and no friction's doing.
     assert robot.bounds["max_speed"] == pytest.approx(1.5 * 1.6)
     assert robot.bounds["max_current"] == 0.0
     shutil.rmtree(robot.folder)
     limits = ["--max-speed", "3", "--max-current", "2"]
-    assert main([*given, *limits]) == 0
+    assert main([*robot.given, *limits]) == 0
     asked = [robot.bounds[f"max_{name}"] for name in ("speed", "current")]
     assert asked == [3.0, 2.0]
 

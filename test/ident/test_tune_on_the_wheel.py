@@ -3,13 +3,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from wheel_simulation import Timing, simulate_closed_loop
+from wheel_simulation import Run, Timing, simulate_closed_loop
 
 from smp_motor_control.fields import parameters_in
 from smp_motor_control.fields import settings_of as settings_of_parameters
@@ -22,7 +23,7 @@ from smp_motor_control.reference.time_optimal import VoltageLimited
 from smp_motor_control.wheel.controller import State, WheelController, WheelSettings
 from smp_motor_control.wheel.loop import LoopSettings, WheelLoop
 from smp_motor_ident.cli.tuning import read_estimates
-from smp_motor_ident.tune import Loop, design, design_wheels
+from smp_motor_ident.tune import Design, Loop, design, design_wheels
 from smp_motor_ident.tune.feedback import Feedback
 from smp_motor_ident.tune.motors import motors_of
 from smp_motor_ident.tune.plant import sample
@@ -48,6 +49,15 @@ def settings_of(one) -> LoopSettings:
         drive=replace(plan.drive, top_speed=plan.drive.top_speed / ratio),
         model=MotorModel(**one.motor),
     )
+
+
+def driven(wheel: str, one: Design, setpoint: Callable[[float], float], seconds: float) -> Run:
+    """Return the drive of a motor of the paper on its design."""
+    return simulate_closed_loop(
+        load_motors(MOTORS)[wheel], settings_of(one), setpoint, seconds,
+        timing=Timing(sample_time=one.loop.sample_time, delay=one.loop.expected_delay),
+        drive=DriveSettings(command_timeout=np.inf, pwm_steps=1000),
+    )  # fmt: skip
 
 
 @pytest.fixture(scope="module")
@@ -96,14 +106,7 @@ def test_a_wheel_alone_is_as_fast_as_its_voltage_allows(estimates, rate, share):
     one = design(estimates["rear_right"], Loop(sample_time=T))
     drive, ratio = one.reference.drive, one.loop.gear_ratio
     target = share * drive.top_speed / ratio
-    run = simulate_closed_loop(
-        load_motors(MOTORS)["rear_right"],
-        settings_of(one),
-        lambda time: target,
-        0.6,
-        timing=Timing(sample_time=T, delay=one.loop.expected_delay),
-        drive=DriveSettings(command_timeout=np.inf, pwm_steps=1000),
-    )
+    run = driven("rear_right", one, lambda time: target, 0.6)
     outside = np.flatnonzero(np.abs(run.velocity - target) > 0.02 * target)
     arrived = run.time[outside[-1] + 1]
     quickest = VoltageLimited(
@@ -119,17 +122,9 @@ def test_four_wheels_arrive_together_without_overshoot(estimates, rate):
     T = 1 / rate
     loops = {wheel: Loop(sample_time=T) for wheel in estimates}
     wheels = design_wheels(estimates, loops)
-    entries = load_motors(MOTORS)
     times = []
     for wheel, one in wheels.designs.items():
-        run = simulate_closed_loop(
-            entries[wheel],
-            settings_of(one),
-            lambda time: STEP,
-            0.8,
-            timing=Timing(sample_time=T, delay=one.loop.expected_delay),
-            drive=DriveSettings(command_timeout=np.inf, pwm_steps=1000),
-        )
+        run = driven(wheel, one, lambda time: STEP, 0.8)
         speed = run.velocity
         assert speed.max() < 1.02 * STEP
         outside = np.flatnonzero(np.abs(speed - STEP) > 0.02 * STEP)
@@ -141,16 +136,8 @@ def test_four_wheels_arrive_together_without_overshoot(estimates, rate):
 def test_a_reversal_turns_the_friction_voltage_in_time(estimates):
     T = 0.005
     designs = design_wheels(estimates, {wheel: Loop(sample_time=T) for wheel in estimates}).designs
-    entries = load_motors(MOTORS)
     for wheel, one in designs.items():
-        run = simulate_closed_loop(
-            entries[wheel],
-            settings_of(one),
-            lambda time: 1.0 if time < 1.0 else -2.0,
-            2.0,
-            timing=Timing(sample_time=T, delay=one.loop.expected_delay),
-            drive=DriveSettings(command_timeout=np.inf, pwm_steps=1000),
-        )
+        run = driven(wheel, one, lambda time: 1.0 if time < 1.0 else -2.0, 2.0)
         # 0.9 % of the change for the slowest winding; turned with the delayed reference, 2.2 %.
         assert run.velocity.min() > -2.0 - 0.013 * 3.0
 
