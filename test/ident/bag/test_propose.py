@@ -96,16 +96,108 @@ def test_names_of_other_languages_and_units_in_brackets_are_understood(tmp_path,
     assert len(read_records(path, list_topics(path)[0].suggestion)["motor"]) == N
 
 
-def test_of_two_voltages_the_one_that_explains_the_speed_is_proposed(tmp_path):
-    voltage, speed = motor(4)
-    other = motor(5)[0]
-    path = write(tmp_path / "log.csv", t=T, u_other=other, input_volts=voltage, omega=speed)
-    assert list_topics(path)[0].suggestion[0] == "voltage=input_volts"
+def asked(listing: Listing) -> list[str]:
+    return [text.partition("=")[0] for text in listing.asked]
 
 
-def test_nothing_is_proposed_where_nothing_explains_the_speed(tmp_path):
-    path = write(tmp_path / "log.csv", t=T, voltage=motor(6)[0], speed=motor(7)[1])
-    assert list_topics(path)[0].suggestion == []
+def chance() -> dict[str, np.ndarray]:
+    rng = np.random.default_rng(26)
+    return {f"signal_{chr(97 + k)}": np.cumsum(rng.normal(0, 1, 32)) for k in range(16)}
+
+
+UNSIGNED = dict(t=T, u=np.abs(motor(14)[0]))
+OTHER = np.convolve(motor(12)[1], [0.0, 0.5, 0.5])[:N]
+NO_VOLTAGE, NO_MOTION = "no field is called a voltage", "no field is called a motion"
+NONE_EXPLAINS = "no field that is called a voltage explains one that is called a motion"
+PROPOSED = {
+    # Columns made of voltage and speed of a motor of this seed, and what is proposed of them.
+    "the voltage that explains the speed": (
+        4, lambda u, w: dict(t=T, u_other=motor(5)[0], input_volts=u, omega=w),
+        "voltage=input_volts velocity=omega time=t"),
+    "a duty": (13, lambda u, w: dict(t_ms=1e3 * T, duty=u / 6, w=w),
+               "voltage=duty:duty velocity=w time=t_ms:ms"),
+    "a duty of 100": (13, lambda u, w: dict(t_ms=1e3 * T, duty=u / 6 * 100, w=w),
+                      "voltage=duty:pwm velocity=w time=t_ms:ms"),
+    "a duty in pct": (13, lambda u, w: dict(t_ms=1e3 * T, duty_pct=u / 6 * 100, w=w),
+                      "voltage=duty_pct:% velocity=w time=t_ms:ms"),
+    "a duty in percent": (13, lambda u, w: dict(t_ms=1e3 * T, duty_percent=u / 6, w=w),
+                          "voltage=duty_percent:% velocity=w time=t_ms:ms"),
+    "a size with its direction": (14, lambda u, w: UNSIGNED | dict(dir=u > 0, w=w),
+                                  "voltage=u velocity=w direction=dir time=t"),
+    "a sign needs no direction": (14, lambda u, w: dict(t=T, u=u, dir=u > 0, w=w),
+                                  "voltage=u velocity=w time=t"),
+    "both without sign": (
+        14, lambda u, w: UNSIGNED | dict(dir=np.where(u > 0, 1, 2), w=np.abs(w)),
+        "voltage=u velocity=w time=t"),
+    "fractions are no counts": (15, lambda u, w: dict(t=T, u=u, encoder=np.cumsum(w) * 0.01),
+                                "voltage=u position=encoder time=t"),
+    "one voltage of two motors": (
+        23, lambda u, w: dict(t=T, u=u, velL=w, velR=0.9 * w),
+        "left.voltage=u left.velocity=velL right.voltage=u right.velocity=velR time=t"),
+    "a Vin that is switched": (24, lambda u, w: dict(time=T, Vin=u, taco=w),
+                               "voltage=Vin velocity=taco time=time"),
+    "the nearest word": (
+        25, lambda u, w: {"Vin_test.taco.time": T, "Vin_test.taco.values": w,
+                          "Vin_test.Vin.values": u},
+        'voltage="Vin_test.Vin.values" velocity="Vin_test.taco.values" time="Vin_test.taco.time"'),
+    "volts before their PWM, a speed before counts": (
+        11, lambda u, w: dict(t=T, pwm=np.rint(u / 12 * 999), Voltage_V=np.round(u, 3),
+                              Delta_Count=np.rint(w * 20), rpm=w),
+        "voltage=Voltage_V velocity=rpm:rpm time=t"),
+    "counts in total": (
+        11, lambda u, w: dict(t=T, pwm=np.rint(u / 12 * 999), Voltage_V=np.round(u, 3),
+                              encoder=np.cumsum(np.rint(w * 20))),
+        "voltage=Voltage_V count=encoder time=t"),
+    "a power before another wheel's speed": (
+        12, lambda u, w: dict(t=T, powerPctLeft=np.rint(u * 10), vLeft=w, vRight=OTHER),
+        "voltage=powerPctLeft:% velocity=vLeft time=t"),
+    "an angle that starts again at 360": (
+        13, lambda u, w: dict(t=T, volts=u, angle=np.rad2deg(np.cumsum(w) * 0.001) % 360),
+        "voltage=volts position=angle:deg time=t"),
+    "a time is no voltage": (1, lambda u, w: dict(t=T, input=1e3 * T, pwm=u, speed=w),
+                             "voltage=pwm:pwm velocity=speed time=t"),
+    "a speed command is no voltage": (1, lambda u, w: dict(t=T, speed_cmd=20 * u, u=u, speed=w),
+                                      "voltage=u velocity=speed time=t"),
+}  # fmt: skip
+NOT_PROPOSED = [
+    (6, lambda u, w: dict(t=T, voltage=u, temperature=motor(7)[1]), NO_MOTION),
+    (6, lambda u, w: dict(t=T, temperature=u, speed=motor(7)[1]), NO_VOLTAGE),
+    (6, lambda u, w: dict(t=T, heat=u, light=motor(7)[1]), NO_VOLTAGE + " or a motion"),
+    (6, lambda u, w: dict(t=T, voltage=u, speed=motor(7)[1]), NONE_EXPLAINS),
+    *((12, lambda u, w, name=name: {"Tempo": T, name: 300.0 - w, "Esforço": u}, NO_MOTION)
+      for name in ("Erro", "error", "Fehler", "ang_err")),
+    (11, lambda u, w: dict(zip(("c1", "c2", "c3"), (T, np.cumsum(w) * 0.01, w))),
+     NO_VOLTAGE + " or a motion"),
+    (14, lambda u, w: UNSIGNED | dict(dir=np.where(u > 0, 1, 2), w=w),
+     NONE_EXPLAINS + "; dir: direction has the values 1, 2, and which is backwards is unknown"),
+    (15, lambda u, w: dict(t=T, u=u, encoder_V=np.cumsum(w) * 0.01), NO_MOTION),
+    (24, lambda u, w: dict(time=T, vin=12 - 0.01 * np.abs(w), taco=w), NO_VOLTAGE),
+    (26, lambda u, w: chance(), NO_VOLTAGE + " or a motion"),
+    (1, lambda u, w: dict(t=T, input=1e3 * T, speed=w), NONE_EXPLAINS),
+    (1, lambda u, w: {"t": T, "pose.x": u, "pose.y": np.cumsum(w), "speed": w,
+                      "motor_current": 0.3 * u}, NO_VOLTAGE),
+    (1, lambda u, w: dict(x=u, y=np.cumsum(w), theta=0.01 * np.cumsum(w), omega=w),
+     NO_VOLTAGE),
+    (1, lambda u, w: dict(t=T, speed_cmd=20 * u, speed=w), NO_VOLTAGE),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("name", PROPOSED)
+def test_fields_that_behave_according_to_their_names_are_proposed(tmp_path, name):
+    seed, columns, items = PROPOSED[name]
+    listing = list_topics(write(tmp_path / "log.csv", **columns(*motor(seed))))[0]
+    assert " ".join(listing.suggestion) == items
+    if "duty" in name:
+        scale = ["pwm_full_scale"] if ":pwm" in items else []
+        assert asked(listing) == [*scale, "supply_voltage"]
+
+
+@pytest.mark.parametrize(("seed", "columns", "remark"), NOT_PROPOSED)
+def test_nothing_is_proposed_where_no_voltage_moves_a_motion_and_why_is_told(
+    tmp_path, seed, columns, remark
+):
+    listing = list_topics(write(tmp_path / "log.csv", **columns(*motor(seed))))[0]
+    assert listing.suggestion == [] and listing.remark.split(". ")[0] == remark
 
 
 @pytest.mark.parametrize(
@@ -127,32 +219,12 @@ def test_a_step_that_no_test_can_confirm_is_proposed_by_names(tmp_path, begin, e
     assert len(read_records(path, listing.suggestion)["motor"]) == N
 
 
-@pytest.mark.parametrize(
-    ("names", "reason"),
-    [
-        (("t", "voltage", "temperature"), "no field is called a motion"),
-        (("t", "temperature", "speed"), "no field is called a voltage"),
-        (("t", "heat", "light"), "no field is called a voltage or a motion"),
-        (("t", "voltage", "speed"), "no field that is called a voltage explains one that"),
-    ],
-)
-def test_why_nothing_is_proposed_is_told(tmp_path, names, reason):
-    path = write(tmp_path / "log.csv", **dict(zip(names, (T, motor(6)[0], motor(7)[1]))))
-    listing = list_topics(path)[0]
-    assert listing.suggestion == []
-    assert listing.remark.startswith(reason)
-
-
 def test_a_mapping_of_the_rim_asks_for_the_wheels_radius(tmp_path):
     path = write(tmp_path / "log.csv", **dict(zip(("t", "u", "speed (m/s)"), (T, *motor(9)))))
     listing = list_topics(path)[0]
     assert listing.suggestion[1] == 'velocity="speed (m/s)":m/s'
     assert [text.partition("=")[0] for text in listing.asked] == ["wheel_radius"]
     assert len(read_records(path, [*listing.suggestion, "wheel_radius=0.05"])["motor"]) == N
-
-
-def asked(listing: Listing) -> list[str]:
-    return [text.partition("=")[0] for text in listing.asked]
 
 
 @pytest.mark.parametrize(
@@ -181,72 +253,12 @@ def test_where_names_tell_too_little_the_data_do(tmp_path, names, separator, sug
     np.testing.assert_allclose(record.voltage[1:], voltage[:-1], atol=6 / 255)
 
 
-@pytest.mark.parametrize("error", ["Erro", "error", "Fehler", "ang_err"])
-def test_the_error_of_a_loop_is_not_a_motion(tmp_path, error):
-    voltage, speed = motor(12)
-    rows = zip(T, 300.0 - speed, voltage)
-    text = "\n".join(f"{t:.2f};{e:.4f};{v:.4f}" for t, e, v in rows)
-    (tmp_path / "log.csv").write_text(f"Tempo;{error};Esforço\n{text}")
-    listing = list_topics(tmp_path / "log.csv")[0]
-    assert listing.suggestion == [] and listing.remark == "no field is called a motion"
-
-
-def test_a_speed_is_not_proposed_as_the_voltage_of_its_own_angle(tmp_path):
-    speed = motor(11)[1]
-    rows = zip(T, np.cumsum(speed) * 0.01, speed)
-    (tmp_path / "log.txt").write_text("\n".join(f"{t:.2f} {a:.4f} {w:.4f}" for t, a, w in rows))
-    listing = list_topics(tmp_path / "log.txt")[0]
-    assert listing.suggestion == []
-    assert listing.remark == "no field is called a voltage or a motion"
-
-
 def test_the_interval_of_a_table_without_time_is_asked_for(tmp_path):
     path = write(tmp_path / "log.csv", **dict(zip("uy", motor(12))))
     listing = list_topics(path)[0]
     assert listing.suggestion == ["voltage=u", "velocity=y"]
     assert asked(listing) == ["velocity", "sample_time"]  # "w" would be in rad/s
     assert len(read_records(path, [*listing.suggestion, "sample_time=0.01"])["motor"]) == N
-
-
-@pytest.mark.parametrize(
-    ("name", "full", "unit", "told"),
-    [
-        ("duty", 1.0, ":duty", ["supply_voltage"]),
-        ("duty", 100.0, ":pwm", ["pwm_full_scale", "supply_voltage"]),
-        ("duty_pct", 100.0, ":%", ["supply_voltage"]),
-        ("duty_percent", 1.0, ":%", ["supply_voltage"]),
-    ],
-)
-def test_the_scale_of_a_duty_is_named_or_asked_for(tmp_path, name, full, unit, told):
-    voltage, speed = motor(13)
-    path = write(tmp_path / "log.csv", **{"t_ms": 1e3 * T, name: voltage / 6 * full, "w": speed})
-    listing = list_topics(path)[0]
-    assert listing.suggestion == [f"voltage={name}{unit}", "velocity=w", "time=t_ms:ms"]
-    assert asked(listing) == told
-
-
-def test_a_size_is_proposed_with_its_direction(tmp_path):
-    voltage, speed = motor(14)
-    columns = {"t": T, "u": np.abs(voltage), "dir": voltage > 0, "w": speed}
-    listing = list_topics(write(tmp_path / "log.csv", **columns))[0]
-    assert listing.suggestion == ["voltage=u", "velocity=w", "direction=dir", "time=t"]
-    listing = list_topics(write(tmp_path / "log.csv", **{**columns, "u": voltage}))[0]
-    assert listing.suggestion == ["voltage=u", "velocity=w", "time=t"]  # it has its sign
-    columns["dir"] = np.where(voltage > 0, 1, 2)
-    listing = list_topics(write(tmp_path / "log.csv", **columns))[0]
-    assert listing.suggestion == []
-    assert "which is backwards is unknown" in listing.remark
-    columns["w"] = np.abs(speed)
-    listing = list_topics(write(tmp_path / "log.csv", **columns))[0]
-    assert listing.suggestion == ["voltage=u", "velocity=w", "time=t"]
-
-
-def test_fractional_numbers_are_not_counts(tmp_path):
-    voltage, speed = motor(15)
-    path = write(tmp_path / "log.csv", t=T, u=voltage, encoder=np.cumsum(speed) * 0.01)
-    assert list_topics(path)[0].suggestion == ["voltage=u", "position=encoder", "time=t"]
-    path = write(tmp_path / "log.csv", t=T, u=voltage, encoder_V=np.cumsum(speed) * 0.01)
-    assert list_topics(path)[0].suggestion == []
 
 
 @pytest.mark.parametrize(
@@ -273,38 +285,6 @@ def test_motors_are_told_apart_by_the_endings_of_names(tmp_path, names, wheels):
     assert sorted(items) == sorted([*expected, f"time={names[0]}"])
 
 
-def test_one_voltage_is_of_all_motors_that_stand_side_by_side(tmp_path):
-    u, y = motor(23)
-    path = write(tmp_path / "log.csv", t=T, u=u, velL=y, velR=0.9 * y)
-    found = ["left.voltage=u", "left.velocity=velL", "right.voltage=u", "right.velocity=velR"]
-    assert list_topics(path)[0].suggestion == [*found, "time=t"]
-
-
-def test_a_vin_that_is_switched_drives_and_one_that_stays_supplies(tmp_path):
-    voltage, speed = motor(24)
-    path = write(tmp_path / "lab.csv", time=T, Vin=voltage, taco=speed)
-    assert list_topics(path)[0].suggestion == ["voltage=Vin", "velocity=taco", "time=time"]
-    sagging = 12 - 0.01 * np.abs(speed)
-    path = write(tmp_path / "ina.csv", time=T, vin=sagging, taco=speed)
-    assert list_topics(path)[0].remark == "no field is called a voltage"
-
-
-def test_the_nearest_word_determines_the_role_of_a_field(tmp_path):
-    voltage, speed = motor(25)
-    names = ("Vin_test.taco.time", "Vin_test.taco.values", "Vin_test.Vin.values")
-    path = write(tmp_path / "log.csv", **dict(zip(names, (T, speed, voltage))))
-    quoted = [f'"{name}"' for name in names]
-    items = [f"voltage={quoted[2]}", f"velocity={quoted[1]}", f"time={quoted[0]}"]
-    assert list_topics(path)[0].suggestion == items
-
-
-def test_a_chance_correlation_is_not_proposed(tmp_path):
-    rng = np.random.default_rng(26)
-    columns = {f"signal_{chr(97 + k)}": np.cumsum(rng.normal(0, 1, 32)) for k in range(16)}
-    listing = list_topics(write(tmp_path / "log.csv", **columns))[0]
-    assert listing.suggestion == []
-
-
 def test_columns_of_one_length_are_listed_and_proposed_together(tmp_path):
     voltage, speed = motor(27)
     content = {"id": {"InputData": voltage, "OutputData": speed, "last": np.arange(6.0)}, "t": T}
@@ -320,33 +300,6 @@ def test_columns_of_one_length_are_listed_and_proposed_together(tmp_path):
     assert len(read_records(tmp_path / "lab.mat", items)["motor"]) == N
     with pytest.raises(BagError, match=r"differ in length: limits 2, .*map columns of one length"):
         read_records(tmp_path / "lab.mat", ["voltage=limits", *items[1:]])
-
-
-def test_counts_of_an_interval_are_no_angle_and_volts_go_before_their_pwm(tmp_path):
-    voltage, speed = motor(11)
-    columns = {"t": T, "pwm": np.rint(voltage / 12 * 999), "Voltage_V": np.round(voltage, 3)}
-    counts = np.rint(speed * 20)
-    path = write(tmp_path / "log.csv", **columns, Delta_Count=counts, rpm=speed)
-    suggestion = list_topics(path)[0].suggestion
-    assert suggestion == ["voltage=Voltage_V", "velocity=rpm:rpm", "time=t"]
-    path = write(tmp_path / "sum.csv", **columns, encoder=np.cumsum(counts))
-    assert list_topics(path)[0].suggestion == ["voltage=Voltage_V", "count=encoder", "time=t"]
-
-
-def test_a_power_of_a_motor_goes_before_another_wheels_speed(tmp_path):
-    voltage, speed = motor(12)
-    other = np.convolve(speed, [0.0, 0.5, 0.5])[:N]
-    columns = {"t": T, "powerPctLeft": np.rint(voltage * 10), "vLeft": speed, "vRight": other}
-    listing = list_topics(write(tmp_path / "log.csv", **columns))[0]
-    assert listing.suggestion[0] == "voltage=powerPctLeft:%"
-    assert listing.suggestion[1].startswith("velocity=v")
-
-
-def test_an_angle_that_starts_again_at_360_is_in_degrees(tmp_path):
-    voltage, speed = motor(13)
-    angle = np.rad2deg(np.cumsum(speed) * 0.001) % 360
-    listing = list_topics(write(tmp_path / "log.csv", t=T, volts=voltage, angle=angle))[0]
-    assert listing.suggestion[1] == "position=angle:deg"
 
 
 def robot(space: str, efforts: np.ndarray, seed: int, drive: str = "pwm") -> list[object]:
@@ -402,38 +355,6 @@ def test_every_robot_of_a_bag_is_proposed(tmp_path):
     given = [*listing.suggestion, "pwm_full_scale=255", "supply_voltage=12"]
     records = read_records(path, given)
     np.testing.assert_allclose(records["robot2_left"].velocity, motor(2)[1])
-
-
-def test_a_time_is_not_proposed_as_a_voltage(tmp_path):
-    voltage, speed = motor(1)
-    path = write(tmp_path / "log.csv", t=T, input=1e3 * T, pwm=voltage, speed=speed)
-    assert list_topics(path)[0].suggestion[:2] == ["voltage=pwm:pwm", "velocity=speed"]
-    path = write(tmp_path / "none.csv", t=T, input=1e3 * T, speed=speed)
-    assert list_topics(path)[0].suggestion == []
-
-
-def test_a_place_is_not_proposed_where_a_speed_is_named(tmp_path):
-    voltage, speed = motor(1)
-    columns = {"pose.x": voltage, "pose.y": np.cumsum(speed), "speed": speed}
-    path = write(tmp_path / "log.csv", t=T, **columns, motor_current=0.3 * voltage)
-    listing = list_topics(path)[0]
-    assert listing.suggestion == [] and listing.remark == "no field is called a voltage"
-
-
-def test_columns_of_a_pose_are_not_a_drive(tmp_path):
-    voltage, speed = motor(1)
-    theta = 0.01 * np.cumsum(speed)
-    path = write(tmp_path / "log.csv", x=voltage, y=np.cumsum(speed), theta=theta, omega=speed)
-    listing = list_topics(path)[0]
-    assert listing.suggestion == []
-
-
-def test_a_speed_command_is_not_proposed_as_a_voltage(tmp_path):
-    voltage, speed = motor(1)
-    path = write(tmp_path / "log.csv", t=T, speed_cmd=20 * voltage, u=voltage, speed=speed)
-    assert list_topics(path)[0].suggestion[0] == "voltage=u"
-    path = write(tmp_path / "none.csv", t=T, speed_cmd=20 * voltage, speed=speed)
-    assert list_topics(path)[0].suggestion == []
 
 
 @pytest.mark.parametrize("column", ["position", "voltage"])
