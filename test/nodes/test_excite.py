@@ -5,26 +5,6 @@ from __future__ import annotations
 
 import signal
 
-import pytest
-
-from smp_motor_control.errors import ParameterError
-from smp_motor_control.nodes.excite import Settings
-
-
-@pytest.mark.parametrize(
-    ("given", "words"),
-    [
-        ({"wheel_names": ("left", "left")}, "named twice: left"),
-        ({"wheels": ("left", "left")}, "named twice: left"),
-        ({"wheels": ("front left",)}, "wheel name 'front left'"),
-        ({"wheels": ("",)}, "wheel name ''"),
-        ({"wheel_names": ("all/", "b")}, "wheel name 'all/'"),
-    ],
-)
-def test_wheels_that_have_no_topics_are_refused(given, words):
-    with pytest.raises(ParameterError, match=words):
-        Settings(**given)
-
 
 def test_excite_is_bounded_ends_by_itself_and_ends_at_zero(process, robot, eventually):
     process("motor_plant", "--ros-args", "-p", "rate:=100.0")

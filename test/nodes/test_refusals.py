@@ -5,6 +5,9 @@ from __future__ import annotations
 
 import pytest
 
+from smp_motor_control.errors import ParameterError
+from smp_motor_control.nodes import excite, serial_driver
+
 WHEEL = "-r __ns:=/front_left"
 REFUSED = [
     ("excite", "-p amplitude:=20.0", "must not exceed max_voltage"),
@@ -34,3 +37,30 @@ def test_a_node_refuses_what_it_cannot_run_with_in_one_line(process, node, given
     assert started.wait(20.0) == 2
     (line,) = started.output.strip().splitlines()
     assert words in line
+
+
+@pytest.mark.parametrize(
+    ("node", "given", "words"),
+    [
+        (excite, {"wheel_names": ("left", "left")}, "named twice: left"),
+        (excite, {"wheels": ("left", "left")}, "named twice: left"),
+        (excite, {"wheels": ("front left",)}, "wheel name 'front left'"),
+        (excite, {"wheels": ("",)}, "wheel name ''"),
+        (excite, {"wheel_names": ("all/", "b")}, "wheel name 'all/'"),
+        (serial_driver, {"wheel_names": ("left", "left")}, "a wheel is named twice: left"),
+        (serial_driver, {"wheel_names": ()}, "wheel_names is empty"),
+        (serial_driver, {"wheel_names": ("",)}, "wheel name ''"),
+        (serial_driver, {"wheel_names": ("front left",)}, "wheel name 'front left'"),
+        (serial_driver, {"wheel_names": ("1st",)}, "wheel name '1st'"),
+        (serial_driver, {"wheel_names": ("a/../b",)}, "wheel name"),
+        (serial_driver, {"wheel_names": ("a" * 300,)}, "at most 100"),
+        (serial_driver, {"baud": 0}, "baud is 0"),
+        (serial_driver, {"baud": -9600}, "baud is -9600"),
+        (serial_driver, {"gear_ratio": -1.0}, "gear ratio is -1.0"),
+        (serial_driver, {"gear_ratio": 0.0}, "gear ratio is 0.0"),
+        (serial_driver, {"encoder_bits": 1}, "encoder_bits is 1"),
+    ],
+)
+def test_settings_that_no_robot_has_are_refused(node, given, words):
+    with pytest.raises(ParameterError, match=words):
+        node.Settings(**given)

@@ -21,7 +21,6 @@ from rclpy.node import Node
 
 from smp_interfaces.msg import MotorCommand, MotorState
 from smp_motor_control.errors import ParameterError
-from smp_motor_control.nodes.serial_driver import Settings
 from smp_motor_control.serial_protocol import LineSplitter, decode_state, encode, encode_voltages
 
 GAIN = 20.0
@@ -275,28 +274,6 @@ def test_a_device_that_another_program_has_is_left_alone(board, robot, driver, e
         lambda: any("another program has it open" in m for m in robot.diagnoses),
         20.0, robot.drive, robot.diagnoses,
     )  # fmt: skip
-
-
-@pytest.mark.parametrize(
-    ("given", "words"),
-    [
-        ({"wheel_names": ("left", "left")}, "a wheel is named twice: left"),
-        ({"wheel_names": ()}, "wheel_names is empty"),
-        ({"wheel_names": ("",)}, "wheel name ''"),
-        ({"wheel_names": ("front left",)}, "wheel name 'front left'"),
-        ({"wheel_names": ("1st",)}, "wheel name '1st'"),
-        ({"wheel_names": ("a/../b",)}, "wheel name"),
-        ({"wheel_names": ("a" * 300,)}, "at most 100"),
-        ({"baud": 0}, "baud is 0"),
-        ({"baud": -9600}, "baud is -9600"),
-        ({"gear_ratio": -1.0}, "gear ratio is -1.0"),
-        ({"gear_ratio": 0.0}, "gear ratio is 0.0"),
-        ({"encoder_bits": 1}, "encoder_bits is 1"),
-    ],
-)
-def test_options_that_no_board_has_are_refused(given, words):
-    with pytest.raises(ParameterError, match=words):
-        Settings(**given)
 
 
 def test_a_line_that_was_spoilt_is_never_taken():
