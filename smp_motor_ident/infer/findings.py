@@ -97,10 +97,7 @@ def refuse(judged: Judged) -> None:
             raise InsufficientExcitationError(
                 f"{where}: the motor is at rest, its sensor shows only noise; raise the voltage"
             )
-        if _is_angle(judged.group):
-            raise SignalError(
-                f"{where}: the speed follows the voltage as an angle does; map it as position"
-            )
+        _refuse_angle(where, judged.group)
         raise SignalError(
             f"{where}: the voltage does not explain the motion (fit {fitted:.0f} %); check "
             "that voltage and encoder belong to the same motor, that the driver applies the "
@@ -115,23 +112,25 @@ def refuse(judged: Judged) -> None:
                 f"{largest:.3g} A; zero the current sensor at rest and record again"
             )
     if judged.quantity("dc_gain") is None and judged.quantity("steady_speed") is None:
+        _refuse_angle(where, judged.group)
         raise InsufficientExcitationError(
             f"{where}: the data do not determine the DC gain; record a longer excitation with "
             "several frequencies, in both directions and well above the friction"
         )
 
 
-def _is_angle(group: Sequence[Record]) -> bool:
-    """Tell whether a mapped speed is explained by a motor's angle."""
+def _refuse_angle(where: str, group: Sequence[Record]) -> None:
+    """Refuse records with a mapped speed that a motor's angle explains."""
     if any(r.velocity is None or r.count is not None or r.position is not None for r in group):
-        return False
+        return
     angles = [replace(r, velocity=None, position=r.velocity) for r in group]
     data = prepare(angles, use_current=False)
-    best = guesses(data, 1)
-    if not best:
-        return False
-    found = fit(data, best[0], data.scales(1.0), data.initial, rounds=1)
-    return explained(data, found.motion) > limits.FIT_EXPLAINS.value
+    for chain in guesses(data, 1):
+        found = fit(data, chain, data.scales(1.0), data.initial, rounds=1)
+        if explained(data, found.motion) > limits.FIT_EXPLAINS.value:
+            raise SignalError(
+                f"{where}: the speed follows the voltage as an angle does; map it as position"
+            )
 
 
 def _nearly_constant(judged: Judged) -> bool:
