@@ -22,7 +22,7 @@ from smp_motor_ident.fit.data import Data
 from smp_motor_ident.fit.descend import Fit
 from smp_motor_ident.infer.instrument_limits import CURRENT_ACCURACY, ONE_SIZE_ACCURACY
 from smp_motor_ident.infer.levels import Levels
-from smp_motor_ident.infer.uncertainty import Contribution
+from smp_motor_ident.infer.uncertainty import DRIVER_SLOTS, Contribution
 from smp_motor_ident.quality.limits import LOOSE_QUANTITY
 from smp_motor_ident.record import Hardware
 from smp_motor_ident.result import NORMAL_95, UNITS, Quantity, Share, Systematic
@@ -33,18 +33,6 @@ BY_CURRENT: Mapping[str, float] = {
 }  # fmt: skip
 """Powers of the current's scale: with a current s times as large the same motion and voltage are
 those of R/s, L/s, s J, s b and s Tc, and of the same K."""
-DRIVER_SLOTS = (
-    "dead_zone",
-    "clip",
-    "sag",
-    "drop",
-    "current_limit",
-    "decay",
-    "free",
-    "slew",
-    "drag",
-)
-"""Slots whose components take a part of the voltage that depends on its size."""
 CAUSES = {
     "window": "averaged_speed",
     "vc": "one_level", "viscous": "damping", "ln_a2": "second_lag", "ln_a0": "prior_gain",

@@ -36,6 +36,11 @@ from smp_motor_ident.infer.levels import Levels
 SUPPORTED = 0.1  # probability from which a component is part of the random uncertainty
 KNOWN = 100.0  # squared ratio of prior and posterior width from which the data show a size
 
+DRIVER_SLOTS = (
+    "dead_zone", "clip", "sag", "drop", "current_limit", "decay", "free", "slew", "drag",
+)  # fmt: skip
+"""Slots whose components take a part of the voltage that depends on its size."""
+
 
 @dataclass(frozen=True, eq=False)
 class Contribution:
@@ -63,7 +68,7 @@ def contributions(
     some = data.thinned(SEARCH_ROWS)
     seen = found if some is data else restate(some, found)
     share = seen.linear.row.size / found.linear.row.size
-    parts += considered(some, seen, 1 / share)
+    parts += considered(some, seen, bool(levels.one_size), 1 / share)
     parts += of_relabelled(some, seen)
     seconds = TIMING_ACCURACY.value * data.sample if timing is None else timing
     parts += of_timing(some, seen, seconds)
@@ -143,18 +148,23 @@ def of_relabelled(data: Data, found: Fit) -> Iterator[Contribution]:
         yield Contribution(one.code, nothing, weight * np.array(changes), adds)
 
 
-def considered(data: Data, found: Fit, rows: float = 1.0) -> list[Contribution]:
+def considered(
+    data: Data, found: Fit, one_size: bool = False, rows: float = 1.0
+) -> list[Contribution]:
     """Return what each absent component would change, weighted by how probable it is.
 
     A component of size s moves the parameters by ``g s``.  The data put s at ``m`` with variance v,
     of a prior of variance t^2; it is there with the probability w that follows from the prior odds
-    and the gain in likelihood: ``w g g^T (m^2 + v)``.  ``rows``: rows of the recording for each of
-    those that are looked at.  Of an effect that is proportional to its size, the smallest is taken.
+    and the gain in likelihood: ``w g g^T (m^2 + v)``.  Of an effect that is proportional to its
+    size, the smallest is taken.  Where the voltage has ``one_size``, an effect of the driver is
+    systematic: it changes the gain, and only details of transients would show it.  ``rows``: rows
+    of the recording for each row of the data.
     """
     policy = replace(SelectionPolicy(), extra=0.0)
     best: dict[str, tuple[float, float, Contribution]] = {}
     for one, chain in candidates(found, data):
-        part = _considered(one, chain, data, found, policy, rows)
+        hidden = one_size and one.slot in DRIVER_SLOTS
+        part = _considered(one, chain, data, found, policy, rows, hidden)
         small = typical_size(one, chain, found) if one.linear else 0.0
         if part is not None and (one.code not in best or (small, part[0]) > best[one.code][:2]):
             best[one.code] = small, *part
@@ -162,7 +172,13 @@ def considered(data: Data, found: Fit, rows: float = 1.0) -> list[Contribution]:
 
 
 def _considered(
-    one: Component, chain: Chain, data: Data, found: Fit, policy: SelectionPolicy, rows: float
+    one: Component,
+    chain: Chain,
+    data: Data,
+    found: Fit,
+    policy: SelectionPolicy,
+    rows: float,
+    hidden: bool,
 ) -> tuple[float, Contribution] | None:
     r = residual(data, chain, found)
     if r is None:
@@ -188,7 +204,7 @@ def _considered(
     shown = information**2 / (KNOWN**2 + information**2)  # share of the size that the data show
     spread = weight * shown * (size**2 + variance)
     unseen = (1 - shown) * unit**2
-    if weight < SUPPORTED:  # the record does not speak for it, nor quite against it
+    if hidden or weight < SUPPORTED:  # the record does not speak for it, nor quite against it
         spread, unseen = 0.0, unseen + spread
     return weight, Contribution(
         one.code, spread * np.outer(shift, shift), shift * math.sqrt(unseen)

@@ -149,11 +149,16 @@ def _groups(length: Array, edges: Integers, step: float) -> tuple[Integers, Arra
     low, high = float(length.min()), float(length.max())
     if high - low <= SAME * step and not edges.any():
         return np.zeros(length.size, dtype=np.int64), np.array([length[0]]), np.zeros(1, np.int64)
-    sample = np.round(length[:: max(length.size // 2000, 1)] / (SAME * 10 * step))
-    if np.unique(sample).size > MOST_GROUPS:
+    kind = np.round(length / (SAME * 10 * step)).astype(np.int64) * 4 + edges + 1
+    _, seen = np.unique(kind[:: max(length.size // 2000, 1)], return_counts=True)
+    if np.sort(seen)[-MOST_GROUPS:].sum() < 0.5 * seen.sum():
         return np.full(length.size, -1), np.zeros(0), np.zeros(0, dtype=np.int64)
-    key = np.round(length / (SAME * 10 * step)).astype(np.int64) * 4 + edges + 1
-    kinds, index, group = np.unique(key, return_index=True, return_inverse=True)
-    if kinds.size > MOST_GROUPS:
-        return np.full(length.size, -1), np.zeros(0), np.zeros(0, dtype=np.int64)
-    return group.astype(np.int64), length[index], edges[index]
+    kinds, index, group, count = np.unique(
+        kind, return_index=True, return_inverse=True, return_counts=True
+    )
+    if kinds.size <= MOST_GROUPS:
+        return group.astype(np.int64), length[index], edges[index]
+    often = np.sort(np.argsort(-count, kind="stable")[:MOST_GROUPS])
+    place = np.full(kinds.size, -1)
+    place[often] = np.arange(often.size)
+    return place[group], length[index[often]], edges[index[often]]
