@@ -87,6 +87,7 @@ def _fit(arrival: Integers) -> tuple[Array, float, float] | None:
     if 4 * window > since.size:
         return None
     number = np.arange(since.size, dtype=np.float64)
+    begins = _edges(since.size, since.size // window)[:-1]
     for lost in (0, 1):
         if lost:
             number += _lost(since, number, window)
@@ -94,11 +95,18 @@ def _fit(arrival: Integers) -> tuple[Array, float, float] | None:
                 return None
         begin, period = _line(number, since)
         latency = since - begin - period * number
-        floors = [part.min() for part in np.array_split(latency, since.size // window)]
+        highest_floor = np.minimum.reduceat(latency, begins).max()
         # What arrives late catches up: where the sender is regular the floor stays.
-        if period > 0 and max(floors) <= BEAT_FLOOR.value * period * longest:
+        if period > 0 and highest_floor <= BEAT_FLOOR.value * period * longest:
             return begin + period * number, period, _deviation(number, since)
     return None
+
+
+def _edges(size: int, count: int) -> Integers:
+    """Return where so many parts of about equal length begin, and the end of the last."""
+    part = np.arange(count + 1)
+    edges: Integers = part * (size // count) + np.minimum(part, size % count)
+    return edges
 
 
 def _deviation(number: Array, since: Array) -> float:
@@ -110,8 +118,8 @@ def _deviation(number: Array, since: Array) -> float:
 
 def _lost(since: Array, number: Array, window: int) -> Array:
     """Return the number of samples lost up to each: a loss raises the floor by whole periods."""
-    parts = np.array_split(np.arange(since.size), since.size // (2 * window))
-    parts = parts[:: max(len(parts) // 200, 1)]
+    edges = _edges(since.size, since.size // (2 * window))
+    parts = [slice(*ends) for ends in pairwise(edges)][:: max((edges.size - 1) // 200, 1)]
     period = float(np.median([_line(number[p], since[p])[1] for p in parts]))
     lost = np.zeros(since.size)
     if period <= 0:

@@ -2,9 +2,9 @@
 """CSV files as loggers, scopes and spreadsheets write them."""
 
 import csv
-import io
 import re
 from collections.abc import Sequence
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +27,7 @@ _LABEL = re.compile(
 """Label before each number in the rows of a serial plotter or debug output."""
 _UNIT = re.compile(r"(?<=\d) ?([A-Za-z%°µ][\w%°µ/]*)(?=\s*(?:[,;|]|$))")
 """Unit behind a labelled number: ``Speed: 33 rpm, Duty: 40%``."""
+_EXAMINED_ROWS = 60  # rows that tell the layout
 _MAX_LABELLED_ROW = 4096  # characters of a row that may have labels
 
 
@@ -36,10 +37,10 @@ class _CsvFile(Tables):
     def __init__(self, path: Path, name: str, budget: Budget) -> None:
         super().__init__(path, name)
         self._lines = _text(path).splitlines()
-        filled = [k for k, s in enumerate(self._lines) if s.strip() and not s.startswith(_COMMENTS)]
-        if not filled:
+        filled = (k for k, s in enumerate(self._lines) if s.strip() and not s.startswith(_COMMENTS))
+        seen = list(islice(filled, _EXAMINED_ROWS))
+        if not seen:
             raise BagError(f"{path}: is empty")
-        seen = filled[:60]
         if sum(map(_is_quoted_row, (self._lines[k] for k in seen))) > len(seen) / 2:
             self._lines = [s.strip()[1:-1] if _is_quoted_row(s) else s for s in self._lines]
         if all(self._lines[k].rstrip().endswith(";") for k in seen):
@@ -95,21 +96,21 @@ class _CsvFile(Tables):
         names = self._grid.names
         self._check(fields, names)
         use = [names.index(name) for name in fields]
-        body = self._lines[self._first :]
-        fast = self._read_plain_numbers(body, use)
+        fast = self._read_plain_numbers(use)
         if fast is not None:
             return Table(None, None, dict(zip(fields, fast)))
+        body = self._lines[self._first :]
         lines = [k for k, s in enumerate(body, self._first + 1) if not s.startswith("#")]
         rows = [_row(s, self._separator) for s in body if not s.startswith("#")]
         values, findings, dates = grid.columns(rows, use, fields, str(self.path), lines)
         columns = dict(zip(fields, values))
         return Table(None, None, columns, findings=findings, exact=frozenset(dates))
 
-    def _read_plain_numbers(self, body: list[str], use: list[int]) -> list[NDArray[Any]] | None:
+    def _read_plain_numbers(self, use: list[int]) -> list[NDArray[Any]] | None:
         """Return columns of plain numbers; None where cells need a closer look."""
         try:
             values = np.loadtxt(
-                io.StringIO("\n".join(body)),
+                (f"{line}\n" for line in islice(self._lines, self._first, None)),
                 delimiter=None if self._separator == " " else self._separator,
                 usecols=use,
                 ndmin=2,
