@@ -25,6 +25,7 @@ from smp_motor_ident.errors import BagError, InsufficientExcitationError, Parame
 from smp_motor_ident.estimate import estimate
 from smp_motor_ident.infer.planning import what_next
 from smp_motor_ident.infer.validation import simulate, split
+from smp_motor_ident.quality.excitation import excerpts
 from smp_motor_ident.record import Record
 from smp_motor_ident.report import figures, history, summary, words
 from smp_motor_ident.report.document import (
@@ -162,6 +163,7 @@ def identify_wheel(
     say: Callable[[str], None],
 ) -> Outcome:
     """Estimate one motor; a refusal is an outcome too, with its reason."""
+    records, kept = excerpts(records), excerpts(kept)
     try:
         found = estimate(records, model, fixed=fixed, validation=list(kept) or None, progress=say)
     except ParameterError:

@@ -1,11 +1,19 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The parts of recordings that tell of a motor: rest before and after the excitation removed."""
+"""The parts of recordings that tell of a motor: the excitation, and stretches of a long one."""
+
+from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
 from smp_motor_control.arrays import Array
-from smp_motor_ident.quality.limits import REST
+from smp_motor_ident.finding import Finding
+from smp_motor_ident.quality.limits import FEWEST, REST
+from smp_motor_ident.quality.sample_limits import EXCERPT
 from smp_motor_ident.record import Record
+
+STRETCHES = 8
+"""Stretches of a long record: enough to show a motor that changes, each long against its lag."""
 
 LONG = 2_000  # samples of rest that are worth removing
 MARGIN = 10  # samples of rest kept on either side
@@ -37,3 +45,32 @@ def excitation(record: Record) -> tuple[int, int]:
         return 0, len(record)
     # An offset of the sensor, seen long enough at rest, would speak against any friction.
     return max(0, int(busy[0]) - MARGIN), min(len(record), int(busy[-1]) + MARGIN + 1)
+
+
+def excerpts(records: Sequence[Record], most: int = round(EXCERPT.value)) -> list[Record]:
+    """Return evenly spread stretches of records that have more than ``most`` rows in all."""
+    rows = sum(map(len, records))
+    count = -(-STRETCHES // len(records)) if records else 0
+    parts: list[Record] = []
+    for record in records:
+        length = most * len(record) // (rows * count)
+        if rows <= most or length < FEWEST.value:
+            parts.append(record)
+        else:
+            parts += _stretches(record, count, length)
+    return parts
+
+
+def _stretches(record: Record, count: int, length: int) -> list[Record]:
+    """Return stretches of so many rows each, with a finding that tells of them."""
+    found = Finding(
+        "excerpt",
+        "note",
+        f"the record has {len(record)} rows; {count} stretches of {length} rows were used, since "
+        "more rows take longer and hardly narrow the estimates",
+        {"rows": float(len(record)), "used": float(count * length)},
+        "cut the recording to have a certain part of it used",
+    )
+    record = replace(record, findings=(*record.findings, found))
+    begins = np.linspace(0, len(record) - length, count).astype(np.int64).tolist()
+    return [record.slice(begin, begin + length) for begin in begins]

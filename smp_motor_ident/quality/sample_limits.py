@@ -85,3 +85,11 @@ LEFT_BY_SILENCE = Limit(
     "an encoder that is silent in most of a record must be repaired",
     "test_silence.py: a motor that is blocked for a while is estimated from the rest",
 )  # fmt: skip
+
+# Rows of a long recording that are used.
+EXCERPT = Limit(
+    200_000, "rows",
+    "cost: a minute of processor for ten million rows; that many tell the numbers more narrowly "
+    "than the instruments are known",
+    "test_excerpts.py: the stretches of a long record tell its motor",
+)  # fmt: skip

@@ -1,0 +1,66 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Of a long recording stretches are used."""
+
+from __future__ import annotations
+
+import motors
+import numpy as np
+
+from smp_motor_ident.cli.identification import identify_wheel
+from smp_motor_ident.estimate import estimate
+from smp_motor_ident.quality.excitation import STRETCHES, excerpts
+from smp_motor_ident.quality.sample_limits import EXCERPT
+from smp_motor_ident.record import Record
+
+SIGMAS = 4.0  # one of four quantities passes them by chance in 4,000 records; the seed is fixed
+
+
+def test_a_record_that_is_not_long_is_used_whole() -> None:
+    record = motors.record(seconds=2.0)
+    assert excerpts([record, record], 2 * len(record)) == [record, record]
+    assert excerpts([]) == []
+
+
+def test_stretches_are_spread_evenly_over_a_long_record() -> None:
+    whole = motors.record(seconds=20.0)
+    parts = excerpts([whole], 4_000)
+    assert [len(part) for part in parts] == STRETCHES * [500]
+    begins = np.linspace(0, len(whole) - 500, STRETCHES).astype(int)
+    for part, begin in zip(parts, begins, strict=True):
+        assert np.array_equal(part.voltage, whole.voltage[begin : begin + 500])
+    (found,) = parts[0].findings[len(whole.findings) :]
+    assert found.code == "excerpt"
+    assert found.evidence == {"rows": 12_000.0, "used": 4_000.0}
+
+
+def test_records_share_the_rows_by_their_length_and_short_ones_stay_whole() -> None:
+    whole = motors.record(seconds=20.0)
+    parts = excerpts([whole, whole.slice(0, 6_000), whole.slice(0, 60)], 4_000)
+    assert [len(part) for part in parts] == [*3 * [885], *3 * [442], 60]
+
+
+def test_the_stretches_of_a_long_record_tell_its_motor() -> None:
+    found = estimate(excerpts([motors.record(seconds=20.0, current=False)], 4_000))
+    truth = motors.truth("rear_left", 0.3)
+    for name in ("dc_gain", "time_constant", "time_constant_product", "static_voltage"):
+        quantity = found.combinations[name]
+        assert quantity.value is not None and quantity.std is not None
+        assert abs(quantity.value - truth[name]) < SIGMAS * quantity.std
+
+
+def test_identify_uses_and_shows_stretches_of_a_long_record() -> None:
+    rows = round(1.2 * EXCERPT.value)
+    rng = np.random.default_rng(0)
+    time = 0.001 * np.arange(rows)
+    voltage = np.repeat(rng.uniform(-6.0, 6.0, rows // 100), 100)
+    speed = np.zeros(rows)
+    keep = np.exp(-0.001 / 0.06)
+    for k in range(1, rows):
+        speed[k] = keep * speed[k - 1] + (1 - keep) * 25.0 * voltage[k]
+    record = Record("motor", time, voltage, velocity=speed + rng.normal(0.0, 0.5, rows))
+    outcome = identify_wheel([record], (), "auto", {}, lambda _: None)
+    assert outcome.estimate is not None
+    assert [f.code for f in outcome.estimate.findings].count("excerpt") == 1
+    gain = outcome.estimate.combinations["dc_gain"]
+    assert abs(gain.value - 25.0) < SIGMAS * gain.std
+    assert len(outcome.comparisons) == STRETCHES
