@@ -40,7 +40,6 @@ CONTROL, BAG = "smp_motor_control.", "smp_motor_ident.bag."
 TESTS = {
     CONTROL + "pid": "control/test_pid_law.py control/test_pid.py "
                      "control/test_pid_conformance.py",
-    CONTROL + "pid_gains": "control/test_pid_law.py control/test_pid.py",
     CONTROL + "encoder": "control/test_encoder.py",
     CONTROL + "wheel.freshness": "control/test_supervision.py",
     CONTROL + "wheel.faults": "control/test_fault_detector.py control/test_supervision.py",

@@ -27,7 +27,7 @@ import numpy as np
 from smp_motor_control.encoder import DifferencedSpeed
 from smp_motor_control.motor.file import MotorEntry, load_motors
 from smp_motor_control.motor.friction import Motor
-from smp_motor_control.motor.model import MotorModel
+from smp_motor_control.motor.parameters import MotorModel
 from smp_motor_control.observer import SpeedObserver
 from smp_motor_control.pid import Pid, PidGains
 

@@ -29,7 +29,7 @@ from rclpy.serialization import serialize_message
 from smp_interfaces.msg import MotorDescription, MotorState
 from smp_motor_control.excitation import Fourier
 from smp_motor_control.motor.file import MotorEntry, load_motors
-from smp_motor_control.motor.model import MotorModel
+from smp_motor_control.motor.parameters import MotorModel
 from smp_motor_control.pid import PidGains
 from smp_motor_control.wheel.loop import LoopSettings
 from smp_motor_ident.bag import read_records

@@ -16,13 +16,7 @@ MAX_BITS = 63
 
 @dataclass(frozen=True)
 class Encoder:
-    """An incremental encoder on the motor shaft.
-
-    Examples
-    --------
-    >>> Encoder(500.0, bits=8).count(2 * math.pi * 0.26)   # 130 counts in eight bits
-    -126
-    """
+    """An incremental encoder on the motor shaft."""
 
     counts_per_revolution: float = 500.0  # of the motor, after quadrature decoding
     bits: int = 0  # width of the two's complement counter; 0 never wraps
@@ -98,12 +92,6 @@ class CounterWidth:
 
     A large step is a wrap when removing a full range of some width leaves a step similar to the
     previous one.
-
-    Examples
-    --------
-    >>> width = CounterWidth()
-    >>> [width.step(count) for count in (32740, 32760, -32756, -32736)]
-    [0, 0, 16, 0]
     """
 
     def __init__(self) -> None:

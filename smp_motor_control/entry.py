@@ -59,17 +59,13 @@ def explain_missing_module(error: ModuleNotFoundError) -> str:
         return "smp_interfaces is not found; build both packages of the repository and source them"
     if name in ("rclpy", "launch", *_ROS_MODULES) or name.endswith("_msgs"):
         return f"{name} is not found; source ROS 2 Jazzy and the workspace, or setup.bash"
-    package = _PIP_NAMES.get(name, name)
-    return f"the Python package {name} is not installed; type: {_pip_command()} {package}"
-
-
-def _pip_command() -> str:
-    """Return pip's install command, with the option that an externally managed Python needs."""
     import sysconfig
 
     marker = os.path.join(sysconfig.get_path("stdlib"), "EXTERNALLY-MANAGED")
     marked = sys.prefix == sys.base_prefix and os.path.isfile(marker)
-    return f"pip install{' --break-system-packages' if marked else ''}"
+    command = f"pip install{' --break-system-packages' if marked else ''}"
+    package = _PIP_NAMES.get(name, name)
+    return f"the Python package {name} is not installed; type: {command} {package}"
 
 
 def node(name: str, package: str = "smp_motor_control") -> Callable[[], int]:

@@ -2,12 +2,7 @@
 """Dataclass fields with descriptions and limits, from which nodes declare their parameters.
 
 Settings are frozen dataclasses and may be nested.  A parameter's name is that of its field (or
-``name``), after the prefixes of the settings that contain it::
-
-    @dataclass(frozen=True, kw_only=True)
-    class Settings:
-        timeout: float = described(0.5, "Silence after which the wheel stops [s].", minimum=0.0)
-        noise: ObserverNoise = nested(ObserverNoise(), prefix="observer.")
+``name``), after the prefixes of the settings that contain it.
 """
 
 import dataclasses
@@ -35,11 +30,6 @@ class Described(NamedTuple):
     def limited(self) -> bool:
         """Whether the number has a limit."""
         return math.isfinite(self.minimum) or math.isfinite(self.maximum)
-
-    def with_zero_for_infinity(self) -> "Described":
-        """Return the description of a parameter in which 0 means infinity."""
-        default = 0.0 if math.isinf(self.default) else self.default
-        return self._replace(default=default, text=f"{self.text.rstrip('.')}; 0 for none.")
 
 
 class _Nested(NamedTuple):
@@ -70,16 +60,6 @@ def optional(kind: type, *needs: str, prefix: str) -> Any:
     return dataclasses.field(default=None, metadata={"": _Nested(kind, prefix, needs)})
 
 
-def documented(settings: type[S]) -> type[S]:
-    """Append the descriptions of the fields to a class's docstring."""
-    lines = [settings.__doc__ or "", "    Attributes", "    ----------"]
-    for field, known in _described_fields(settings):
-        if isinstance(known, Described):
-            lines += [f"    {field.name}", f"        {known.text}"]
-    settings.__doc__ = "\n".join(lines)
-    return settings
-
-
 def parameters_in(settings: type, default: Any = None, prefix: str = "") -> dict[str, Described]:
     """Return the parameters of settings by name; ``default`` is an instance with their defaults."""
     found = {}
@@ -87,9 +67,10 @@ def parameters_in(settings: type, default: Any = None, prefix: str = "") -> dict
         value = field.default if default is None else getattr(default, field.name)
         if isinstance(known, Described):
             known = known._replace(default=value)
-            found[prefix + (known.name or field.name)] = (
-                known.with_zero_for_infinity() if known.endless else known
-            )
+            if known.endless:
+                shown = 0.0 if math.isinf(value) else value
+                known = known._replace(default=shown, text=f"{known.text.rstrip('.')}; 0 for none.")
+            found[prefix + (known.name or field.name)] = known
             continue
         inside = prefix + known.prefix
         for name, one in parameters_in(known.kind, value, inside).items():

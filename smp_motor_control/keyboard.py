@@ -37,13 +37,7 @@ _SEQUENCE = re.compile(r"\x1b(?:\[|O)[0-9;]*([A-Za-z~])|\x1b|(.)", re.DOTALL)
 
 
 def parse_keys(text: str) -> list[str]:
-    """Return the keys in a terminal's characters.
-
-    Examples
-    --------
-    >>> keys_of("W\x1b[A\x1b[5~+")
-    ['w', 'up', '+']
-    """
+    """Return the keys in a terminal's characters."""
     keys = []
     for match in _SEQUENCE.finditer(text):
         final, plain = match.groups()

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Steady-state Kalman filter of the motor speed from encoder counts and voltage.
 
-The state is ``(theta, w, w', d)`` of :mod:`~smp_motor_control.motor.model`.  The load d is a
-random walk, so that a constant load does not bias the speed:
+The state is ``(theta, w, w', d)`` of :class:`~smp_motor_control.motor.parameters.MotorModel`.  The
+load d is a random walk, so that a constant load does not bias the speed:
 
     theta' = w,   tp w'' + tau w' + w = K (v - friction - d + n_v),   d' = n_d,
     counts = theta / q + quantisation, uniform, variance 1/12.
@@ -31,7 +31,7 @@ from smp_motor_control.arrays import Array
 from smp_motor_control.encoder import DifferencedSpeed, Encoder, Unwrapper
 from smp_motor_control.errors import ParameterError, check_range
 from smp_motor_control.fields import described
-from smp_motor_control.motor.model import MotorModel
+from smp_motor_control.motor.parameters import MotorModel
 from smp_motor_control.motor.response import FreeResponse, zero_order_hold
 
 _STEPS_PER_OCTAVE = 2

@@ -17,12 +17,110 @@ weighting), 3.4 (derivative filter), 3.5 (anti-windup) and 13.4 (bumpless change
 """
 
 import math
+from dataclasses import dataclass
 from typing import NamedTuple
 
-from smp_motor_control.errors import ParameterError
-from smp_motor_control.pid_gains import EPSILON, STRATEGIES, PidGains
+from smp_motor_control.errors import ParameterError, check_range
+from smp_motor_control.fields import described, parameters_in
 
-__all__ = ["EPSILON", "STRATEGIES", "Pid", "PidGains", "PidOutput"]
+EPSILON = 2.220446049250313e-16
+"""Errors, gains and time steps up to this size count as zero."""
+
+MAX_GAIN = 1e9
+"""Maximum of any gain, weight, clamp or time constant; products of three stay finite."""
+
+STRATEGIES = ("none", "back_calculation", "conditional_integration")
+"""Anti-windup strategies."""
+
+_CLAMP = "limit of the output [V], in addition to the supply."
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class PidGains:
+    """Validated settings of a PID controller, named as in control_toolbox."""
+
+    p: float = described(1.0, "Proportional gain [V s/rad, wheel].")
+    i: float = described(0.0, "Integral gain [V/rad].")
+    d: float = described(0.0, "Derivative gain [V s^2/rad].")
+    u_clamp_min: float = described(-math.inf, f"Lower {_CLAMP}")
+    u_clamp_max: float = described(math.inf, f"Upper {_CLAMP}")
+    i_clamp_min: float = described(
+        -math.inf, "Lower limit of the integral term [V], not above zero."
+    )
+    i_clamp_max: float = described(
+        math.inf, "Upper limit of the integral term [V], not below zero."
+    )
+    antiwindup_strategy: str = described(
+        "none",
+        "Integral while the output is clamped: none (it continues), back_calculation (it is driven "
+        "back) or conditional_integration (it stops winding up).",
+    )
+    tracking_time_constant: float = described(
+        0.0, "Time constant of back-calculation [s]; 0: sqrt(d/i), or p/i without d.", minimum=0.0
+    )
+    error_deadband: float = described(
+        EPSILON, "Error up to which the integral is frozen [rad/s].", minimum=0.0
+    )
+    setpoint_weight_p: float = described(1.0, "Weight of the reference in the proportional term.")
+    setpoint_weight_d: float = described(0.0, "Weight of the reference in the derivative term.")
+    derivative_filter_time_constant: float = described(
+        0.0, "Time constant of the first-order derivative filter [s]; 0: none.", minimum=0.0
+    )
+    feedforward_static: float = described(
+        0.0, "Voltage against dry friction, in the direction of the reference [V].", minimum=0.0
+    )
+    feedforward_velocity: float = described(0.0, "Voltage per speed [V s/rad].")
+    feedforward_acceleration: float = described(0.0, "Voltage per acceleration [V s^2/rad].")
+
+    def __post_init__(self) -> None:
+        _check_strategy(self.antiwindup_strategy)
+        for name, least in _MIN_VALUES.items():
+            value = getattr(self, name)
+            if not ("_clamp_" in name and value in (-math.inf, math.inf)):
+                value = check_range(name, value, least, MAX_GAIN)
+            object.__setattr__(self, name, value)
+        if not self.u_clamp_min < self.u_clamp_max:
+            raise ParameterError(
+                f"u_clamp_min is {self.u_clamp_min} and u_clamp_max {self.u_clamp_max}: "
+                "the first must be below the second"
+            )
+        if self.i_clamp_min > 0.0 or self.i_clamp_max < 0.0:
+            raise ParameterError(
+                f"i_clamp_min is {self.i_clamp_min} and i_clamp_max {self.i_clamp_max}: "
+                "the first must not be above zero, the second not below"
+            )
+
+    @property
+    def effective_tracking_time_constant(self) -> float:
+        """Time constant of back-calculation [s], with the default for 0 filled in.
+
+        With an effective value of 0 the integral follows the clamp at once.
+        """
+        given = self.tracking_time_constant
+        if given > EPSILON or abs(self.i) <= EPSILON:
+            return given
+        if abs(self.d) > EPSILON:
+            return math.sqrt(abs(self.d / self.i))
+        return abs(self.p / self.i)
+
+
+_MIN_VALUES = {
+    name: max(one.minimum, -MAX_GAIN)
+    for name, one in parameters_in(PidGains).items()
+    if name != "antiwindup_strategy"
+}
+
+
+def _check_strategy(value: object) -> None:
+    if value == "legacy":
+        raise ParameterError(
+            "antiwindup_strategy 'legacy' is not offered: use 'none' with i_clamp_min and "
+            "i_clamp_max, which limits the integral as legacy_antiwindup did"
+        )
+    if value not in STRATEGIES:
+        raise ParameterError(
+            f"antiwindup_strategy is {value!r}; it must be one of {', '.join(STRATEGIES)}"
+        )
 
 
 class PidOutput(NamedTuple):
@@ -48,23 +146,10 @@ class Pid:
     ----------
     gains : PidGains
         Settings; change them later with :meth:`set_gains`.
-
-    Attributes
-    ----------
-    gains : PidGains
-        Settings in force.
-    i_term : float
-        Integral term of the next step.
-
-    Examples
-    --------
-    >>> pid = Pid(PidGains(p=2.0, i=1.0, u_clamp_max=5.0))
-    >>> pid.step(1.0, 0.0, dt=0.5).output, pid.step(1.0, 0.0, dt=0.5).output
-    (2.0, 2.5)
     """
 
-    gains: PidGains
-    i_term: float
+    gains: PidGains  # in force
+    i_term: float  # integral term of the next step
     _previous: float | None  # c r - y of the previous step
     _rate: float  # filtered rate of c r - y
     _last_inputs: tuple[float, float, float] | None  # inputs of the last step
@@ -109,36 +194,14 @@ class Pid:
         acceleration: float = 0.0,
         error_rate: float | None = None,
     ) -> PidOutput:
-        """Advance the controller by one sample.
+        """Advance the controller by one sample of ``dt`` [s]; with 0 return the previous output.
 
-        Parameters
-        ----------
-        reference, measurement : float
-            Reference and measured speed [rad/s, wheel].
-        dt : float
-            Time since the previous step [s].  With 0 the previous output is returned.
-        acceleration : float
-            Rate of the reference [rad/s^2], for the feed-forward only.
-        error_rate : float, optional
-            Measured rate of ``c r - y`` [rad/s^2]; replaces differencing, not the filter.  A later
-            step does not difference from such a step, as in control_toolbox.
-
-        Returns
-        -------
-        PidOutput
-            All NaN except the unchanged integral when an input is not finite; such a step has no
-            effect on later ones.
-
-        Raises
-        ------
-        ParameterError
-            When dt is negative, NaN or infinite.
-
-        Notes
-        -----
-        Before the first step the reference is assumed equal to the measurement, so that enabling
-        the controller on a turning wheel gives no derivative kick unless ``setpoint_weight_d``
-        is set.
+        Speeds are at the wheel [rad/s]; ``acceleration`` of the reference [rad/s^2] is for the
+        feed-forward only.  A measured ``error_rate`` of ``c r - y`` [rad/s^2] replaces
+        differencing, not the filter, and later steps do not difference from it, as in
+        control_toolbox.  When an input is not finite all but the integral is NaN, and the step has
+        no effect on later ones.  Before the first step the reference is assumed equal to the
+        measurement, so that a turning wheel gets no derivative kick without ``setpoint_weight_d``.
         """
         if not EPSILON < dt < _INF:
             if -EPSILON <= dt <= EPSILON:
@@ -229,13 +292,7 @@ class Pid:
         return self._last_output
 
     def reset(self, save_i_term: bool = False) -> None:
-        """Discard the state.
-
-        Parameters
-        ----------
-        save_i_term : bool
-            Keep the integral.
-        """
+        """Discard the state, except the integral if ``save_i_term``."""
         if not save_i_term:
             self.i_term = 0.0
         self._previous = None

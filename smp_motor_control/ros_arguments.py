@@ -5,13 +5,7 @@ from collections.abc import Sequence
 
 
 def split_arguments(argv: Sequence[str]) -> tuple[list[str], list[str]]:
-    """Return a program's own arguments and those from ``--ros-args`` to ``--``.
-
-    Examples
-    --------
-    >>> split_arguments(["bag", "--ros-args", "-r", "__ns:=/robot1", "--", "--force"])
-    (['bag', '--force'], ['--ros-args', '-r', '__ns:=/robot1', '--'])
-    """
+    """Return a program's own arguments and those from ``--ros-args`` to ``--``."""
     own: list[str] = []
     ros: list[str] = []
     inside = False

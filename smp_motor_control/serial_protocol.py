@@ -58,25 +58,13 @@ def encode(text: str) -> bytes:
 
 
 def encode_voltages(voltages: Sequence[float]) -> bytes:
-    r"""Return the command line of all motors.
-
-    Examples
-    --------
-    >>> encode_voltages([1.5, -12.0])
-    b'V,1500,-12000*4C\n'
-    """
+    """Return the command line of all motors."""
     numbers = [round(1e3 * v) if math.isfinite(v) else 0 for v in voltages]
     return encode(",".join(["V", *map(str, numbers)]))
 
 
 def encode_age(clock: int) -> bytes:
-    r"""Return the line with the clock of the state that the next command responds to.
-
-    Examples
-    --------
-    >>> encode_age(20000)
-    b'A,20000*5F\n'
-    """
+    """Return the line with the clock of the state that the next command responds to."""
     return encode(f"A,{clock}")
 
 

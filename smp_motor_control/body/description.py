@@ -18,12 +18,6 @@ def robot_description(
 
     ``base_link`` is midway between the sides, at the height of the axles.  Wheels of one side are
     three radii apart, the first in front.
-
-    Examples
-    --------
-    >>> text = robot_description(["left"], ["right"], separation=0.3)
-    >>> '<joint name="left_wheel_joint" type="continuous">' in text, 'xyz="0 0.15 0"' in text
-    (True, True)
     """
     robot = Element("robot", name="wheels")
     longest = 3 * radius * max(len(left), len(right))

@@ -19,12 +19,6 @@ class HeadingHold:
 
     ``w_out = w_cmd + clamp(p e + i integral(e))`` with ``e = wrap(integral(w_cmd) - yaw)``.  An
     error beyond ``max_error`` resets the reference to the measured yaw.
-
-    Examples
-    --------
-    >>> hold = HeadingHold(p=2.0, i=0.0)
-    >>> hold.step(0.0, yaw=0.3, dt=0.02), round(hold.step(0.0, yaw=0.2, dt=0.02), 6)
-    (0.0, 0.2)
     """
 
     p: float = described(

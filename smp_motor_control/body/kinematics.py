@@ -10,7 +10,7 @@ from dataclasses import MISSING, dataclass, fields
 from typing import NamedTuple
 
 from smp_motor_control.errors import ParameterError
-from smp_motor_control.fields import described, documented
+from smp_motor_control.fields import described
 
 
 class SideSpeeds(NamedTuple):
@@ -21,21 +21,9 @@ class SideSpeeds(NamedTuple):
     right: float
 
 
-@documented
 @dataclass(frozen=True, kw_only=True)
 class SkidSteer:
-    """Geometry of the body and speed limit of its wheels.
-
-    Raises
-    ------
-    ParameterError
-        When a value is not positive and finite.
-
-    Examples
-    --------
-    >>> SkidSteer(wheel_separation=0.4, wheel_radius=0.1).wheel_speeds(0.0, 1.0)
-    SideSpeeds(left=-2.0, right=2.0)
-    """
+    """Geometry of the body and speed limit of its wheels."""
 
     wheel_separation: float = described(MISSING, "Distance between left and right wheels [m].")
     wheel_radius: float = described(MISSING, "Radius of the wheels [m].")

@@ -17,59 +17,24 @@ class Odometry:
 
     One step follows an arc, ``h1 = h0 + w dt``,
     ``x += v/w (sin h1 - sin h0)``, ``y -= v/w (cos h1 - cos h0)``.
-
-    Parameters
-    ----------
-    wheel_separation : float
-        Effective distance between the sides [m].
-    left_radius, right_radius : float
-        Effective wheel radii [m].
-    window : int
-        Number of steps over which the reported velocity is averaged.
-    travel_noise : float
-        Variance of a side's travel per metre [m^2/m].
-    turn_noise : float
-        Variance of the heading per radian of turning, due to skid [rad^2/rad].
-    max_wheel_speed : float
-        Maximum wheel speed [rad/s]; a faster change of position is a counter reset.
-
-    Attributes
-    ----------
-    x, y, heading : float
-        Pose [m], [m], [rad]; the heading is not wrapped.
-    linear, angular : float
-        Velocity [m/s], [rad/s].
-    covariance : ndarray, shape (3, 3)
-        Of the pose, since the last :meth:`set_odometry`.
-
-    Raises
-    ------
-    ParameterError
-        When a length is not positive, a noise is negative, or the window is below 1.
+    The pose is ``x``, ``y`` [m] and ``heading`` [rad], not wrapped, the velocity ``linear`` [m/s]
+    and ``angular`` [rad/s].
 
     References
     ----------
     R. Siegwart, I. Nourbakhsh and D. Scaramuzza, *Introduction to Autonomous Mobile Robots*,
     2nd ed., MIT Press 2011, section 5.2.4, for the growth of the covariance.
-
-    Examples
-    --------
-    >>> odometry = Odometry(wheel_separation=0.5, left_radius=0.1, right_radius=0.1)
-    >>> odometry.update_from_velocity(10.0, 10.0, 0.5)
-    True
-    >>> odometry.x
-    0.5
     """
 
     def __init__(
         self,
-        wheel_separation: float,
+        wheel_separation: float,  # effective distance between the sides [m]
         left_radius: float,
         right_radius: float,
-        window: int = 10,
-        travel_noise: float = 1e-4,
-        turn_noise: float = 1e-2,
-        max_wheel_speed: float = math.inf,
+        window: int = 10,  # steps over which the reported velocity is averaged
+        travel_noise: float = 1e-4,  # variance of a side's travel per metre [m^2/m]
+        turn_noise: float = 1e-2,  # variance of the heading per radian of turning [rad^2/rad]
+        max_wheel_speed: float = math.inf,  # a faster change of position is a counter reset
     ) -> None:
         self.configure(wheel_separation, left_radius, right_radius, travel_noise, turn_noise)
         if window < 1:
@@ -105,7 +70,7 @@ class Odometry:
         self._velocities.clear()
 
     def set_odometry(self, x: float, y: float, heading: float) -> None:
-        """Set the pose, with zero covariance."""
+        """Set the pose, with zero ``covariance``, shape (3, 3)."""
         self.x, self.y, self.heading = x, y, heading
         self.covariance = np.zeros((3, 3))
 

@@ -29,19 +29,9 @@ class SpeedLimiter:
     deceleration to those of acceleration.  Signs are those of diff_drive_controller: acceleration
     in reverse and deceleration from forward are negative.
 
-    Raises
-    ------
-    ParameterError
-        When a pair does not enclose zero, so that the body could not be stopped.
-
     References
     ----------
     ros-controls/control_toolbox, ``rate_limiter``: order jerk, acceleration, value.
-
-    Examples
-    --------
-    >>> SpeedLimiter(max_velocity=1.0, max_acceleration=2.0).limit(3.0, 0.0, 0.0, 0.1).value
-    0.2
     """
 
     min_velocity: float | None = described(

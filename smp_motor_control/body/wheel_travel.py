@@ -46,20 +46,11 @@ class WheelTravel:
 
     A jump of the position is ignored unless the next sample confirms it, which shows a counter
     reset.  A jump by one revolution is a wrap; a position that never changes was not filled in.
-
-    Attributes
-    ----------
-    angle : float
-        Travel since the first sample [rad].
-    latest : WheelSample
-        The newest accepted sample.
-    jumps, wraps : int
-        Number of resets and of wraps of the position.
     """
 
     def __init__(self, first: WheelSample, angle: float = 0.0) -> None:
-        self.latest, self.angle = first, angle
-        self.jumps = self.wraps = 0
+        self.latest, self.angle = first, angle  # newest accepted sample; travel since the first
+        self.jumps = self.wraps = 0  # resets and wraps of the position
         self._suspect: WheelSample | None = None
         self._unmoved: float | None = 0.0  # integrated velocity at constant position [rad]
         self._past: deque[WheelSample] = deque([first])

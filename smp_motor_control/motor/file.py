@@ -85,9 +85,7 @@ class MotorEntry:
         return not math.isnan(self.resistance)
 
 
-def find_paper_motors() -> Path:
-    """Return the path of the paper's motors."""
-    return find_config("motors_paper.yaml")
+PAPER_MOTORS = "motors_paper.yaml"
 
 
 def find_config(name: str) -> Path:

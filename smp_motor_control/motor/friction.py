@@ -7,7 +7,7 @@ Between two friction events the motor is linear,
     J domega/dt = K i - b omega - Tc sign(omega) - Tl,
 
 with a closed-form response.  Stopping, reversal and break-away are located inside the step, so
-that a step of any length has rounding errors only.
+that a step of any length has rounding errors only (derivation: ``docs/derivations.md``).
 """
 
 import math
@@ -29,22 +29,6 @@ class Motor:
         At the motor shaft.
     current, speed, angle : float
         Initial state [A], [rad/s], [rad]; the current follows the voltage where L = 0.
-
-    Attributes
-    ----------
-    current : float
-        Armature current [A].
-    speed : float
-        [rad/s], motor shaft.
-    angle : float
-        [rad], motor shaft.
-
-    Examples
-    --------
-    >>> motor = Motor(MotorParameters(resistance=2.0, inductance=0.0, motor_constant=0.1,
-    ...                               inertia=1e-4, viscous_friction=0.0))
-    >>> round(motor.step(1.0, 10.0), 6)
-    10.0
     """
 
     def __init__(
@@ -72,30 +56,9 @@ class Motor:
         self._cache: dict[float, Coefficients] = {}
 
     def step(self, voltage: float, dt: float, load_torque: float = 0.0) -> float:
-        """Advance by ``dt`` under constant voltage and load.
+        """Advance by ``dt`` [s] under constant voltage [V] and load; return the speed [rad/s].
 
-        Parameters
-        ----------
-        voltage : float
-            Armature voltage [V].
-        dt : float
-            Length of the step [s], zero or positive.
-        load_torque : float
-            Tl [N m] at the motor shaft; positive brakes positive speed.
-
-        Returns
-        -------
-        float
-            Speed at the end of the step [rad/s].
-
-        Raises
-        ------
-        ParameterError
-            When voltage or load is not finite, or ``dt`` is negative or not finite.
-
-        References
-        ----------
-        Equations of the module; derivation in ``docs/derivations.md``.
+        A positive ``load_torque`` [N m] at the motor shaft brakes positive speed.
         """
         if not (math.isfinite(voltage + load_torque) and 0.0 <= dt < math.inf):
             raise ParameterError(

@@ -1,11 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """Validated parameters of a DC motor and its gearbox."""
 
-from dataclasses import dataclass, fields
+from dataclasses import MISSING, dataclass, fields
 from typing import TypeVar
 
 from smp_motor_control.arrays import Array
 from smp_motor_control.errors import check_range
+from smp_motor_control.fields import described
 
 _UNITS = {
     "resistance": "ohm",
@@ -24,41 +25,23 @@ COMBINATIONS = ("dc_gain", "time_constant", "time_constant_product", "static_vol
 SUPPLY_RANGE_V = (0.1, 1000.0)
 """Range of supply voltages [V]."""
 
+MAX_DELAY_S = 2.0
+"""Maximum delay from voltage to effect; the observer stores voltages for this long."""
+
 _MAY_BE_ZERO = ("inductance", "viscous_friction", "coulomb_friction")
 Motion = TypeVar("Motion", float, Array)
 
 
 @dataclass(frozen=True, kw_only=True)
 class MotorParameters:
-    """Physical parameters of a brushed DC motor at its own shaft.
+    """Physical parameters of a brushed DC motor at its own shaft."""
 
-    Attributes
-    ----------
-    resistance : float
-        Armature resistance R [ohm], positive.
-    inductance : float
-        Armature inductance L [H]; 0 gives a first-order motor.
-    motor_constant : float
-        Torque constant = back-EMF constant K [N m/A = V s/rad], positive.
-    inertia : float
-        Total inertia J [kg m^2], positive.
-    viscous_friction : float
-        Viscous friction b [N m s/rad].
-    coulomb_friction : float
-        Coulomb friction Tc [N m]; also the break-away torque.
-
-    Raises
-    ------
-    ParameterError
-        When a value is out of range.
-    """
-
-    resistance: float
-    inductance: float
-    motor_constant: float
-    inertia: float
-    viscous_friction: float
-    coulomb_friction: float = 0.0
+    resistance: float  # R, of the armature [ohm]
+    inductance: float  # L, of the armature [H]; 0 gives a first-order motor
+    motor_constant: float  # K, of torque and of back-EMF [N m/A = V s/rad]
+    inertia: float  # J, total [kg m^2]
+    viscous_friction: float  # b [N m s/rad]
+    coulomb_friction: float = 0.0  # Tc, also the break-away torque [N m]
 
     def __post_init__(self) -> None:
         for item in fields(self):
@@ -138,6 +121,35 @@ class MotorParameters:
         return self.resistance * self.coulomb_friction / self.motor_constant
 
 
+@dataclass(frozen=True, kw_only=True)
+class MotorModel:
+    """Response from voltage to speed at the motor shaft, for feed-forward and observer.
+
+        tp w'' + tau w' + w = K (v(t - delay) - Vs sign(w) - d)
+
+    with ``K = dc_gain``, ``tau = time_constant``, ``tp = time_constant_product`` and
+    ``Vs = static_voltage``; d is the load, as a voltage.
+    """
+
+    dc_gain: float = described(MISSING, "Steady speed per volt [rad/s/V, motor]; 0: no model.")
+    time_constant: float = described(MISSING, "Sum of the time constants [s].")
+    time_constant_product: float = described(0.0, "Product of the time constants [s^2].")
+    static_voltage: float = described(0.0, "Voltage that overcomes dry friction [V].")
+    delay: float = described(0.0, "Dead time from voltage to effect [s].")
+
+    def __post_init__(self) -> None:
+        check_range("dc_gain of the model", self.dc_gain, 1e-9, 1e9, "rad/s/V")
+        tau = check_range("time_constant of the model", self.time_constant, 1e-7, 1e5, "s")
+        # The largest product gives a thousandth of the critical damping.
+        limits = (
+            ("time_constant_product", 2.5e5 * tau * tau, "s^2"),
+            ("static_voltage", 1e6, "V"),
+            ("delay", MAX_DELAY_S, "s"),
+        )
+        for name, most, unit in limits:
+            check_range(f"{name} of the model", getattr(self, name), 0.0, most, unit)
+
+
 def check_supply(name: str, voltage: float) -> float:
     """Return a supply voltage [V]; raise when it is out of range."""
     return check_range(name, voltage, *SUPPLY_RANGE_V, "V")
@@ -145,13 +157,7 @@ def check_supply(name: str, voltage: float) -> float:
 
 @dataclass(frozen=True)
 class Gearbox:
-    """Conversion between motor shaft and wheel.
-
-    Examples
-    --------
-    >>> Gearbox(65.5).to_motor(2.0)
-    131.0
-    """
+    """Conversion between motor shaft and wheel."""
 
     ratio: float = 1.0  # motor revolutions per wheel revolution; positive
 

@@ -125,12 +125,6 @@ def zero_order_hold(
     """Return the exact discrete model of a batch of motors, arguments of shape (n,) or ().
 
     A ``product`` of 0 gives a first-order motor, whose acceleration follows speed and voltage.
-
-    Examples
-    --------
-    >>> held = zero_order_hold(10.0, 0.1, 0.0, 0.1)
-    >>> float(held.forced[0, 0].round(4))  # 10 (1 - 1/e)
-    6.3212
     """
     given = (dc_gain, time_constant, product, interval)
     gain, tau, tp, t = np.broadcast_arrays(*(np.atleast_1d(np.asarray(x, float)) for x in given))

@@ -175,7 +175,8 @@ class LeanExecutor(SingleThreadedExecutor):
 
     def _do_guard(self, guard: Any) -> None:
         if guard is self._guard:
-            self._gather_again()
+            if self._waits is not None and self._waits[0].key != self.entities():
+                self._release()
         elif guard is not self._sigint_gc:
             guard._executor_triggered = True
             self._do_stock(guard, self._take_guard_condition)
@@ -187,10 +188,6 @@ class LeanExecutor(SingleThreadedExecutor):
         stream = (subscriptions, timers, (), (), guards, ())
         self._waits = waits = (_WaitSet(self, key), _WaitSet(self, stream))
         return waits
-
-    def _gather_again(self) -> None:
-        if self._waits is not None and self._waits[0].key != self.entities():
-            self._release()
 
     def _release(self) -> None:
         for waits in self._waits or ():

@@ -136,7 +136,9 @@ def try_gains(
             reason = _watch(client, watches, trial)
         except RobotError as error:
             reason = str(error)
-    missing = () if reason is None else _restore(client, old)
+    missing = []
+    if reason is not None and not _restores(client, old, 1.0):
+        missing = [n for n, values in old.items() if not _restores(client, {n: values}, 0.5)]
     after = time.monotonic() - begun
     if missing:
         missing = _wait_for_missing(client, missing, old, say)
@@ -155,18 +157,10 @@ def _watch(client: RobotClient, watches: Mapping[str, LoopWatch], trial: float) 
     return None
 
 
-def _restore(client: RobotClient, old: Mapping[str, Mapping[str, Any]]) -> list[str]:
-    """Restore the old parameters; return the nodes that do not answer."""
+def _restores(client: RobotClient, nodes: Mapping[str, Mapping[str, Any]], patience: float) -> bool:
+    """Set the old parameters of nodes; return whether they answer."""
     try:
-        client.set_parameters(old, 1.0)
-    except SmpError:
-        return [node for node, values in old.items() if not _answers(client, node, values, 0.5)]
-    return []
-
-
-def _answers(client: RobotClient, node: str, values: Mapping[str, Any], patience: float) -> bool:
-    try:
-        client.set_parameters({node: values}, patience)
+        client.set_parameters(nodes, patience)
     except SmpError:
         return False
     return True
@@ -188,7 +182,7 @@ def _wait_for_missing(
     end = time.monotonic() + RETURN_TIMEOUT_S
     while missing and time.monotonic() < end:
         for node in list(missing):
-            if _answers(client, node, old[node], 1.0):
+            if _restores(client, {node: old[node]}, 1.0):
                 missing.remove(node)
                 say(f"{node.partition('/')[0]} is back and has its old gains")
     return [node.partition("/")[0] for node in missing]

@@ -147,7 +147,8 @@ class MotorPlant(Node):
             for name in (name for name in given if name.startswith("motors.")):
                 self.declare_parameter(name, given[name], _MOTOR_PARAMETER, ignore_override=True)
             return motor_file.parse_motors(motors, "parameters")
-        return motor_file.load_motors(settings.motors_file or motor_file.find_paper_motors())
+        path = settings.motors_file or motor_file.find_config(motor_file.PAPER_MOTORS)
+        return motor_file.load_motors(path)
 
     def _on_change(self, settings: Settings) -> None:
         self._supply.resistance = settings.supply_resistance

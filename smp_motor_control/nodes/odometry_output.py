@@ -42,10 +42,8 @@ class OdometryOutput:
         self._publisher = node.create_publisher(OdometryMessage, "odom", 10)
         self._joints = node.create_publisher(JointState, "joint_states", 10)
         self._tf = None
-        if settings.enable_odom_tf:
-            self._advertise_transform(node)
-
-    def _advertise_transform(self, node: Node) -> None:
+        if not settings.enable_odom_tf:
+            return
         try:
             from tf2_msgs.msg import TFMessage
         except ImportError:

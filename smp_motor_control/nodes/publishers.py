@@ -49,8 +49,8 @@ def are_publishers_known(node: Node, topic: str) -> bool:
     return all(info.node_name != UNKNOWN_NODE for info in infos)
 
 
-def name_publishers(node: Node, topic: str) -> str:
-    """Return the names of a topic's publishers in the graph, such as ``2 x /play``."""
+def describe_two_publishers(node: Node, topic: str) -> str:
+    """Return the message about a topic with two publishers, with their names in the graph."""
     infos = node.get_publishers_info_by_topic(node.resolve_topic_name(topic))
     names = Counter(
         "an unknown node"
@@ -58,15 +58,9 @@ def name_publishers(node: Node, topic: str) -> str:
         else f"{info.node_namespace.rstrip('/')}/{info.node_name}"
         for info in infos
     )
-    return " and ".join(
-        name if count == 1 else f"{count} x {name}" for name, count in sorted(names.items())
-    )
-
-
-def describe_two_publishers(node: Node, topic: str) -> str:
-    """Return the message about a topic with two publishers."""
-    names = name_publishers(node, topic) or "two nodes"
-    return f"{node.resolve_topic_name(topic)} comes from {names} at once; end one of them"
+    each = (f"{count} x {name}" if count > 1 else name for name, count in sorted(names.items()))
+    who = " and ".join(each) or "two nodes"
+    return f"{node.resolve_topic_name(topic)} comes from {who} at once; end one of them"
 
 
 def with_watch(

@@ -96,8 +96,6 @@ class RobotClient:
             self.node.destroy_node()
             rclpy.try_shutdown(context=self._context)
 
-    # Waiting -------------------------------------------------------------------------------
-
     def until(self, condition: Callable[[], bool], timeout: float) -> bool:
         """Spin until a condition holds; return False at the time-out [s]."""
         end = time.monotonic() + timeout
@@ -238,8 +236,6 @@ class RobotClient:
         if not self.until(lambda: not missing(), timeout):
             raise RobotError(f"{node} does not subscribe to {', '.join(missing())}; is it running?")
 
-    # Services ------------------------------------------------------------------------------
-
     def _absolute_name(self, name: str) -> str:
         return f"{self.node.get_namespace().rstrip('/')}/{name}"
 
@@ -330,8 +326,6 @@ class RobotClient:
             said = ", ".join(f"{self._absolute_name(node)} ({states[node]})" for node in left)
             raise RobotError(f"refused to {transition}: {said}")
 
-    # Restoring ----------------------------------------------------------------------------
-
     def set_pending_restore(self, **pending_restore: Any) -> None:
         """Note the state to restore, before it is changed: ``active`` nodes and ``gains``."""
         self.pending_restore = pending_restore
@@ -377,7 +371,13 @@ class RobotClient:
                         f"{self._absolute_name(wheel)}/motor_command: {', '.join(rival)} commands "
                         "the wheel and cannot be paused; end it first"
                     )
-            nodes = [controller_of(w) for w in wheels if self._has_controller(w, owners.get(w, ""))]
+            # The graph or the driver shows which wheels have a controller.
+            controlled = (
+                wheel
+                for wheel in wheels
+                if "wheel_pid" in self._commanders(wheel) or "/wheel_pid#" in owners.get(wheel, "")
+            )
+            nodes = list(map(controller_of, controlled))
             active = [node for node, state in self.get_states(nodes).items() if state == "active"]
             self.set_pending_restore(active=active)
             self.change_states(active, "deactivate")
@@ -398,7 +398,3 @@ class RobotClient:
         if UNKNOWN_NODE in self._commanders(wheel):
             return False
         return owner_known or self.node.count_publishers(f"{wheel}/motor_owner") == 0
-
-    def _has_controller(self, wheel: str, owner: str) -> bool:
-        """Return whether the graph or the driver shows a controller of the wheel."""
-        return "wheel_pid" in self._commanders(wheel) or "/wheel_pid#" in owner

@@ -33,23 +33,12 @@ from smp_motor_control.nodes.settings import Parameters
 
 POLL_PERIOD_S = 0.002
 SILENCE_S = 0.5  # of a board, after which its line is reopened
-COMMAND_PERIOD_S = (
-    0.05  # longest interval between two commands to the board [s]; it stops after 0.2 s
-)
-BOARD_TIMEOUT_S = (
-    0.2  # a board that was not heard for so long is told nothing: it may not read either [s]
-)
+COMMAND_PERIOD_S = 0.05  # longest interval between two commands; the board stops after 0.2 s
+BOARD_TIMEOUT_S = 0.2  # a board that was silent for so long is told nothing: it may not read
 STALE_AFTER_S = 0.1  # age at which an unsent command is dropped
 EMPTY_RATIO = 0.3  # supply over nominal below which a battery is empty or off
 OVERCHARGED_RATIO = 2.0  # supply over nominal above which a board's reading is wrong
 RESET_JUMP_S = 1.0  # jump of the board's clock that shows a reset
-DESCRIBED_FIELDS = (
-    "gear_ratio",
-    "counts_per_revolution",
-    "encoder_bits",
-    "supply_voltage",
-    "resistance",
-)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -86,9 +75,14 @@ class Wheel:
 
     def __init__(self, node: Node, name: str, settings: Settings) -> None:
         self.settings, self.voltage, self.commanded = settings, 0.0, -math.inf
-        description = MotorDescription(
-            **{name: getattr(settings, name) for name in DESCRIBED_FIELDS}
+        names = (
+            "gear_ratio",
+            "counts_per_revolution",
+            "encoder_bits",
+            "supply_voltage",
+            "resistance",
         )
+        description = MotorDescription(**{name: getattr(settings, name) for name in names})
         timeout = settings.command_timeout
         self._driver = MotorDriver(node, name, timeout, self._on_command, description)
         self.lease = self._driver.lease
@@ -283,18 +277,16 @@ class SerialDriver(Node):
             )
             return runtime.WARN, found, values
         if self._supply != self._battery and not math.isnan(self._battery):
-            return runtime.WARN, self._wrong_supply(), values
+            nominal = self._settings.supply_voltage
+            found = (
+                f"the board reports a supply of {self._battery:g} V, impossible for a battery of "
+                f"{nominal:g} V, so {nominal:g} V limits the motors; correct the board's divider "
+                "or supply_voltage"
+            )
+            return runtime.WARN, found, values
         if rivals:
             return runtime.WARN, rivals, values
         return runtime.OK, "driving", values
-
-    def _wrong_supply(self) -> str:
-        nominal = self._settings.supply_voltage
-        return (
-            f"the board reports a supply of {self._battery:g} V, impossible for a battery of "
-            f"{nominal:g} V, so {nominal:g} V limits the motors; correct the board's divider or "
-            "supply_voltage"
-        )
 
     def on_stop(self) -> None:
         """Command zero."""

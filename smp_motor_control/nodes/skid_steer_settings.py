@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Parameters of skid_steer, named as in diff_drive_controller where equivalent."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 from smp_motor_control import LEFT, RIGHT, check_wheel_names
@@ -11,14 +10,6 @@ from smp_motor_control.body.speed_limiter import SpeedLimiter
 from smp_motor_control.errors import ParameterError
 from smp_motor_control.fields import described, fixed, nested
 from smp_motor_control.wheel.stop import MAX_STOP_TIME_S
-
-
-def check_wheels(left: Sequence[str], right: Sequence[str]) -> None:
-    """Raise for empty, invalid or duplicate wheel names."""
-    for side, names in (("left", left), ("right", right)):
-        if not any(names):
-            raise ParameterError(f"{side}_wheel_names is empty; name at least one wheel")
-    check_wheel_names((*left, *right))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -70,4 +61,7 @@ class Settings:
     angular: SpeedLimiter = nested(SpeedLimiter(), prefix="angular.z.")
 
     def __post_init__(self) -> None:
-        check_wheels(self.left_wheel_names, self.right_wheel_names)
+        for name in ("left_wheel_names", "right_wheel_names"):
+            if not any(getattr(self, name)):
+                raise ParameterError(f"{name} is empty; name at least one wheel")
+        check_wheel_names((*self.left_wheel_names, *self.right_wheel_names))

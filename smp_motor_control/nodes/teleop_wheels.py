@@ -89,11 +89,6 @@ class Terminal:
             sys.stdout.write(text)
             sys.stdout.flush()
 
-    def write_status(self, text: str) -> None:
-        """Replace the current line."""
-        width = shutil.get_terminal_size().columns
-        self.write(f"\r{text[: width - 1]}\x1b[K")
-
     def _on_suspend(self, number: int, frame: FrameType | None) -> None:
         self._suspend()
         self.restore()
@@ -230,7 +225,8 @@ class TeleopWheels(Node):
             line = f"wheel mode  {keyboard.scale * speeds.wheel:.2f} rad/s  {chosen}  | {state}"
             if takers and self.count_publishers(self._setpoints.topic_name) > 1:
                 line += "  (skid_steer also commands the wheels: use body mode)"
-        self._terminal.write_status(line if takers else f"{line}  (no subscriber)")
+        line += "" if takers else "  (no subscriber)"
+        self._terminal.write(f"\r{line[: shutil.get_terminal_size().columns - 1]}\x1b[K")
 
     def _halt(self) -> None:
         """Command zero to all that this node has driven."""

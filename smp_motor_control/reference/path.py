@@ -4,7 +4,7 @@
 import math
 from collections import deque
 
-from smp_motor_control.motor.model import MotorModel
+from smp_motor_control.motor.parameters import MotorModel
 from smp_motor_control.pid import PidGains
 from smp_motor_control.reference.profile import Profile, Reference
 

@@ -36,13 +36,6 @@ class Profile:
     to keep the limits; 0 gives the fastest transition within the limits.  With a ``drive``, a
     change that exceeds its voltage is made as fast as the voltage allows.  Targets are clipped to
     the velocity limit.
-
-    Examples
-    --------
-    >>> profile = Profile(ProfileLimits(acceleration=2.0))
-    >>> profile.set_target(1.0)
-    >>> profile.step(0.25)
-    Reference(velocity=0.5, acceleration=2.0, jerk=0.0)
     """
 
     def __init__(

@@ -13,8 +13,7 @@ import numpy as np
 
 from smp_motor_control.encoder import Encoder
 from smp_motor_control.errors import ParameterError
-from smp_motor_control.motor.model import MotorModel
-from smp_motor_control.motor.parameters import Gearbox
+from smp_motor_control.motor.parameters import Gearbox, MotorModel
 from smp_motor_control.motor.response import zero_order_hold
 from smp_motor_control.pid import PidGains
 from smp_motor_control.reference.profile import UNLIMITED, Profile

@@ -16,7 +16,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from smp_motor_control.motor.model import MotorModel
+from smp_motor_control.motor.parameters import MotorModel
 from smp_motor_control.pid import PidGains
 
 MAX_SENSITIVITY = 1.4

@@ -22,14 +22,6 @@ class Lease:
     so the lease ends ``timeout`` after the last non-zero one; until then other writers are refused.
     A non-zero command that is older than ``timeout`` by its stamp, as from the queue of a delayed
     driver, is refused.
-
-    Examples
-    --------
-    >>> lease = Lease(0.2)
-    >>> lease.take("excite", 3.0, now=0.0), lease.take("wheel_pid", 1.0, now=0.1)
-    (True, False)
-    >>> lease.take("excite", 0.0, now=0.1), lease.take("wheel_pid", 1.0, now=0.21)
-    (True, True)
     """
 
     def __init__(self, timeout: float) -> None:

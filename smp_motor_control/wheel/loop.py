@@ -11,8 +11,7 @@ from dataclasses import dataclass, replace
 from smp_motor_control.encoder import CounterWidth, DifferencedSpeed, Encoder
 from smp_motor_control.errors import ParameterError
 from smp_motor_control.fields import check_limits, described, nested, optional
-from smp_motor_control.motor.model import MotorModel
-from smp_motor_control.motor.parameters import Gearbox
+from smp_motor_control.motor.parameters import Gearbox, MotorModel
 from smp_motor_control.observer import ObserverNoise, SpeedObserver
 from smp_motor_control.pid import Pid, PidGains, PidOutput
 from smp_motor_control.reference.path import ReferencePath

@@ -29,15 +29,7 @@ outliers are not."""
 
 
 class PlausibleSpeed:
-    """Reject a reading that jumps, unless the next one confirms it or readings always jump.
-
-    Examples
-    --------
-    >>> speed = PlausibleSpeed()
-    >>> speed.gross, speed.rate = 1.0, 10.0
-    >>> [speed.accepts(one, 0.01) for one in (0.0, 0.1, 5.0, 0.1)]
-    [True, True, False, True]
-    """
+    """Reject a reading that jumps, unless the next one confirms it or readings always jump."""
 
     def __init__(self) -> None:
         self.gross = self.rate = math.inf  # plausible jump [rad/s] and acceleration [rad/s^2]

@@ -16,14 +16,7 @@ class Bounds:
 
 
 class Protection:
-    """Check the samples of one wheel under test.
-
-    Examples
-    --------
-    >>> watched = Protection(Bounds(speed=10.0))
-    >>> [watched.add(0.02 * k, 0.1, 12.0) for k in range(4)][-1]
-    'it turns at 12 rad/s, the limit is 10 rad/s'
-    """
+    """Check the samples of one wheel under test."""
 
     def __init__(self, bounds: Bounds) -> None:
         self._bounds = bounds

@@ -22,16 +22,7 @@ AVERAGING_WINDOW_S = 0.5
 
 
 class StopRule:
-    """Track the time of a zero set-point and whether the controller still drives the wheel.
-
-    Examples
-    --------
-    >>> rule = StopRule()
-    >>> rule.ask(1.0, now=10.0), rule.ask(0.0, now=12.0)
-    (None, None)
-    >>> rule.overdue(12.9, stop_time=1.0), rule.overdue(13.1, stop_time=1.0)
-    (False, True)
-    """
+    """Track the time of a zero set-point and whether the controller still drives the wheel."""
 
     def __init__(self) -> None:
         self._since = math.inf

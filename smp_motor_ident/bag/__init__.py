@@ -32,17 +32,15 @@ __all__ = [
 ]
 
 _HOMES = {
-    "mapping": ("MotorMap", "Signal", "SignalMap", "load", "parse"),
-    "offers": ("Listing", "Offer"),
-    "propose": ("list_topics",),
-    "read": ("join_records", "read_experiments", "read_records"),
-    "writer": ("BagWriter",),
+    **dict.fromkeys(("MotorMap", "Signal", "SignalMap", "load", "parse"), "mapping"),
+    **dict.fromkeys(("Listing", "Offer"), "offers"),
+    **dict.fromkeys(("join_records", "read_experiments", "read_records"), "read"),
+    **{"list_topics": "propose", "BagWriter": "writer"},
 }
 
 
 def __getattr__(name: str) -> Any:
     """Import a name on first use (PEP 562)."""
-    for module, exported in _HOMES.items():
-        if name in exported:
-            return getattr(import_module(f"{__name__}.{module}"), name)
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    if name not in _HOMES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(import_module(f"{__name__}.{_HOMES[name]}"), name)

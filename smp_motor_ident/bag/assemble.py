@@ -11,7 +11,7 @@ from smp_motor_control.arrays import Array, Integers
 from smp_motor_control.motor.parameters import Gearbox
 from smp_motor_ident.bag import checks, clock, counter, mapping, units
 from smp_motor_ident.bag.axis import Motor, Series, resample_to_output, select_finite, unwrap_counts
-from smp_motor_ident.bag.limits import MAX_COUNT_STEP
+from smp_motor_ident.bag.limits import MAX_COUNT_STEP, MAX_STRAY_ROW_SHARE
 from smp_motor_ident.bag.storage import Table
 from smp_motor_ident.errors import BagError
 from smp_motor_ident.quality.stamps import find_beat, moves_on
@@ -98,8 +98,9 @@ def _fit_arrivals(motor: Motor, topic: str, time: Integers) -> Integers:
 def _check(motor: Motor, series: dict[str, Series]) -> None:
     """Drop impossible values and an unsigned current; sign a magnitude by its direction."""
     if "direction" in series:
-        way = series.pop("direction")
-        if checks.has_sign(series["voltage"].value):
+        way, volts = series.pop("direction"), series["voltage"].value
+        stray = MAX_STRAY_ROW_SHARE.value * np.count_nonzero(volts)
+        if min(np.sum(volts > 0), np.sum(volts < 0)) > stray:
             text = "the voltage has a sign already, so that the direction is not used; leave it out"
             motor.tell("direction_not_used", text)
         else:
@@ -177,17 +178,13 @@ def _clock(motor: Motor) -> dict[str, Integers]:
     because = "; ".join(f"{topic}: {why}" for topic, why in poor.items())
     text = "time: header stamps moved to the recorder's clock by their offset and drift, because "
     motor.tell("time_base", text + (because or "the topics' clocks differ"))
-    return {topic: _to_log(motor, topic, stamps[topic], fits) for topic in tables}
-
-
-def _to_log(
-    motor: Motor, topic: str, stamp: Integers | None, fits: Mapping[str, clock.ClockFit]
-) -> Integers:
-    """Return a topic's stamps on the recorder's clock; its log times where it has none."""
-    if topic not in fits or stamp is None:
-        return motor.tables[topic].logged
-    _report_offset(motor, topic, fits, always=True)
-    return fits[topic].to_log(stamp)
+    moved = {topic: table.logged for topic, table in tables.items()}
+    for topic, fit in fits.items():
+        _report_offset(motor, topic, fits, always=True)
+        stamp = stamps[topic]
+        assert stamp is not None
+        moved[topic] = fit.to_log(stamp)
+    return moved
 
 
 def _times_across_resets(

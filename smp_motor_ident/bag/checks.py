@@ -6,12 +6,7 @@ from scipy.ndimage import median_filter
 
 from smp_motor_control.arrays import Array, Flags
 from smp_motor_ident.bag.axis import Series
-from smp_motor_ident.bag.limits import (
-    MAX_JUMP_SPAN,
-    MAX_JUMP_STEP,
-    MAX_STRAY_ROW_SHARE,
-    UNSIGNED_CURRENT_RATIO,
-)
+from smp_motor_ident.bag.limits import MAX_JUMP_SPAN, MAX_JUMP_STEP, UNSIGNED_CURRENT_RATIO
 from smp_motor_ident.errors import BagError
 
 _MIN_SAMPLES = 50
@@ -71,12 +66,6 @@ def is_unsigned(voltage: Series, current: Series) -> bool:
         return False
     low, high = np.quantile(amperes, [0.05, 0.95])
     return bool(low > -0.2 * high)  # some current may return to the supply
-
-
-def has_sign(value: Array) -> bool:
-    """Return whether a signal has both signs, ignoring outliers."""
-    least = MAX_STRAY_ROW_SHARE.value * np.count_nonzero(value)
-    return bool(min(np.sum(value > 0), np.sum(value < 0)) > least)
 
 
 def apply_direction(size: Series, direction: Series, where: str) -> Series:

@@ -263,10 +263,7 @@ def _overlaps(
 def concatenate_parts(
     times: Sequence[Integers], parts: Sequence[Parts], pauses: Sequence[int]
 ) -> list[Integers]:
-    """Return times [ns] on one continuous clock, with a pause between parts.
-
-    Offsets between tables are kept within each part.
-    """
+    """Return times [ns] on one continuous clock, with a pause between parts of all tables."""
     moved = [time.copy() for time in times]
     for k, pause in enumerate(pauses, 1):
         last = max(int(m[: part[k][0]].max()) for m, part in zip(moved, parts))

@@ -136,7 +136,9 @@ def unwrap(count: Integers, bits: int | None, expected: Array | None = None) -> 
         near = np.rint(guess).astype(np.int64)
         shift = np.int64(64 - bits)
         steps = near + (((steps - near) << shift) >> shift)
-    resets = _find_resets(count, steps, guess, expected is not None) + 1
+    bound = _bound_steps(steps, guess)
+    far = 0.0 if expected is not None else 5 * max(float(np.quantile(np.abs(steps), 0.99)), 1.0)
+    resets = _find_falls(count, np.abs(steps - guess), bound, far) + 1
     if resets.size:
         findings.append(report_resets("encoder's counter", resets.size))
         steps = steps.copy()
@@ -197,12 +199,6 @@ def _width(steps: Integers, guess: Array) -> int:
         if np.all(np.abs(after) < period / 8) and np.all(np.abs(rest[~large]) < period / 4):
             return bits
     return 0
-
-
-def _find_resets(count: Integers, steps: Integers, guess: Array, measured: bool) -> Integers:
-    """Return the steps at which the counter fell to about zero without having turned there."""
-    far = 0.0 if measured else 5 * max(float(np.quantile(np.abs(steps), 0.99)), 1.0)
-    return _find_falls(count, np.abs(steps - guess), _bound_steps(steps, guess), far)
 
 
 def angle_resets(angle: Array) -> Integers:

@@ -18,10 +18,8 @@ from smp_motor_ident.quality.limits import HALF_EXPLAINED
 
 LAGS, OWN = 6, 2
 MAX_DELAY_ROWS = 200  # largest delay of a command behind its motion that is searched [rows]
-CLEAR_RATIO, SIMILAR_RATIO = (
-    0.9,
-    3.0,
-)  # ratio to the residual at other shifts: clearly smaller; similar
+CLEAR_RATIO = 0.9  # a residual so much smaller than at other shifts is clearly the smallest
+SIMILAR_RATIO = 3.0  # up to this ratio residuals are similar
 FINE_SEARCH_ROWS = 20  # rows searched around a coarse estimate of the shift
 SECOND_LAG_ROWS = (0.0, 0.5, 1.0, 2.0)  # rows of a second lag
 MAX_FIT_ROWS = 5000  # rows used for a fit

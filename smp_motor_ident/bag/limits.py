@@ -1,8 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Every threshold of a decision about recordings, with its unit and its reason.
-
-Printed with the others in ``docs/limits.md``.
-"""
+"""Every threshold of a decision about recordings, with its unit and its reason."""
 
 from smp_motor_ident.limits import Limit
 

@@ -94,23 +94,12 @@ class SignalMap:
     # ``.msg`` files or folders of them for types that the bag does not define
     msg_files: tuple[str, ...] = ()
 
-    @property
-    def has_signals(self) -> bool:
-        """Whether any signal is mapped, not only hardware described."""
-        return any(motor.signals for motor in self.motors.values())
-
 
 def parse(items: Iterable[str], msg_files: Iterable[str] = ()) -> SignalMap:
     """Read a mapping as it is written on the command line: ``[WHEEL.]KEY=VALUE``.
 
     KEY is a signal, a property of the hardware or an option; an item may hold several, separated by
     blanks.
-
-    Examples
-    --------
-    >>> m = parse(["voltage=/pwm.data*12/255", "velocity=/joint_states.velocity[left]:rpm"])
-    >>> m.motors["motor"].signals["voltage"].scale
-    0.047058823529411764
     """
     if isinstance(items, str):
         items = [items]

@@ -4,6 +4,8 @@
 import re
 from collections.abc import Sequence
 
+from smp_motor_control.errors import is_ros_name
+
 WORDS_OF_VOLTS = (
     r"volt|spannung|spanning|sp[äæ]nning|(?<!in)tens(?:i[oóu]|[ãa]o)|napi[eę]cie|nap[eěaä]t[ií]"
     r"|gerilim|feszülts|напряж|电压|電圧|전압"
@@ -42,7 +44,8 @@ NO_MOTION = (
     r"set_?point|target|desired|refer[eê]n[ct]|soll|cmd|command|consign|[\W_]m?v$"
     r"|(?:^|\W|_)(?:erro?r?e?|erreur|fehler|hata|uchyb|ошибка)(?:$|\W|_)"
 )
-_HINTS = {
+HINTS = {
+    # Units that names hint at, as a mapping writes them
     "velocity": ((r"rpm|drehzahl", ":rpm"), (r"deg", ":deg/s")),
     "position": ((r"deg", ":deg"),),
     "voltage": ((r"duty", ":duty"), (r"pwm|throttle", ":pwm")),
@@ -110,12 +113,6 @@ def drives_by_name(text: str) -> bool:
     return re.search(DRIVES, text, re.IGNORECASE) is not None
 
 
-def hint_of(role: str, source: str) -> str:
-    """Return the unit that a name hints at, as a mapping writes it."""
-    hints = (text for pattern, text in _HINTS.get(role, ()) if re.search(pattern, source, re.I))
-    return next(hints, "")
-
-
 def wheel_of(source: str) -> str:
     """Return the side of the robot in a name."""
     words = re.split(r"[^a-z]+", split_words(source).lower())
@@ -129,6 +126,12 @@ def motor_of(name: str) -> str:
         return ""
     letter = match[2].lower()
     return _LETTERS.get(letter, f"motor_{letter}")
+
+
+def parent_of(path: str) -> str:
+    """Return the first name of a field's path where it is a ROS name; else nothing."""
+    whole, dot, _ = path.partition(".")
+    return whole if dot and is_ros_name(whole) else ""
 
 
 def is_barred(role: str, text: str) -> bool:

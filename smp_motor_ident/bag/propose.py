@@ -66,7 +66,8 @@ class _Candidate:
         text = f"{self.offer.topic}.{self.path}"
         if unit := unit_of(self.role, self.offer.units.get(self.path, ""), text):
             return f":{unit}"
-        hint = names.hint_of(self.role, text)
+        likely = names.HINTS.get(self.role, ())
+        hint = next((unit for pattern, unit in likely if re.search(pattern, text, re.I)), "")
         whole = self.value[np.isfinite(self.value)]
         if self.role == "voltage" and not hint and whole.size:
             steps = np.array_equal(whole, np.rint(whole)) and np.abs(whole).max() > 48
@@ -117,8 +118,9 @@ def _by_names_and_data(recording: Recording, offers: list[Offer], types: Types) 
     fields = list(_candidates(recording, offers, types, time))
     every = [c for c in fields if c.value.size]
     alone = recording.is_table and len(offers) == 1
-    if alone and time is None:
-        time = _find_unnamed_time(every)
+    unnamed = [c for c in every if not c.role]
+    if alone and time is None and (k := drives.find_clock([c.value for c in unnamed])) is not None:
+        time = replace(unnamed[k], role="time")
     chosen, remarks = _by_names(every)
     if alone and not chosen and (pair := _by_data([c for c in every if c is not time])):
         chosen = [("", pair)]
@@ -146,7 +148,8 @@ def _by_names(every: Sequence[_Candidate]) -> tuple[list[tuple[str, list[_Candid
     for (robot, wheel), fields in sorted(wheels.items()):
         ways = [c for c in fields if c.role == "direction"][:1]
         shared = wheels.get((robot, ""), []) if wheel else []
-        voltages = [c for c in (*fields, *shared) if c.role == "voltage" and _may_drive(c.value)]
+        voltages = [c for c in (*fields, *shared) if c.role == "voltage" and c.value.any()]
+        voltages = [c for c in voltages if drives.find_clock([c.value]) is None]
         motions = [c for c in fields if c.role in names.MOTIONS]
         sizes = [c for c in voltages if ways and c.value.size and c.value.min() >= 0]
         chosen = []
@@ -160,7 +163,10 @@ def _by_names(every: Sequence[_Candidate]) -> tuple[list[tuple[str, list[_Candid
             remarks.append(_remark_on_unconfirmed(chosen[0]))
         if chosen:
             if _is_torque(chosen[0]):
-                remarks.append(_remark_on_torque(chosen[0]))
+                remarks.append(
+                    f"{chosen[0].source} is a torque [N m] by its message's documentation; map it "
+                    "only if your driver writes its command there"
+                )
             current = [c for c in fields if c.role == "current"][:1]
             name = "_".join(filter(None, (robot, wheel)))
             found_by_wheel.append((f"{name}." if name else "", [*chosen, *used, *current]))
@@ -184,21 +190,8 @@ def _namespace(candidate: _Candidate) -> tuple[str, str]:
     return (parts[1], parts[2]) if len(parts) == 3 and not parts[0] else ("", parts[-1])
 
 
-def _may_drive(value: Array) -> bool:
-    """Return whether a field's values allow a voltage: not all 0, and not a clock."""
-    return bool(value.any()) and drives.find_clock([value]) is None
-
-
 def _is_torque(candidate: _Candidate) -> bool:
     return re.search(names.TORQUE, candidate.path, re.IGNORECASE) is not None
-
-
-def _remark_on_torque(candidate: _Candidate) -> str:
-    """Return the remark on a field called effort."""
-    return (
-        f"{candidate.source} is a torque [N m] by its message's documentation; map it only if your "
-        "driver writes its command there"
-    )
 
 
 def _by_motor(every: Sequence[_Candidate]) -> list[_Candidate]:
@@ -206,7 +199,7 @@ def _by_motor(every: Sequence[_Candidate]) -> list[_Candidate]:
 
     A name's ending identifies the motor (``velL``), a field's parent the run (``run_2.u``).
     """
-    for tell in (names.motor_of, _parent_of):
+    for tell in (names.motor_of, names.parent_of):
         named = [c if c.wheel else replace(c, wheel=tell(c.path)) for c in every]
         driven = {c.wheel for c in named if c.role == "voltage"}
         moved = {c.wheel for c in named if c.role in names.MOTIONS and c.wheel}
@@ -216,22 +209,10 @@ def _by_motor(every: Sequence[_Candidate]) -> list[_Candidate]:
     return list(every)
 
 
-def _parent_of(path: str) -> str:
-    whole, dot, _ = path.partition(".")
-    return whole if dot and is_ros_name(whole) else ""
-
-
 def _add_direction(voltage: _Candidate, way: _Candidate) -> _Candidate:
     """Return a magnitude of voltage with its direction; BagError if the codes have no sign."""
     size, direction = (axis.Series(c.time.astype(np.int64), c.value) for c in (voltage, way))
     return replace(voltage, value=checks.apply_direction(size, direction, way.source).value)
-
-
-def _find_unnamed_time(every: list[_Candidate]) -> _Candidate | None:
-    """Return the unnamed column that rises like a time."""
-    unnamed = [c for c in every if not c.role]
-    k = drives.find_clock([c.value for c in unnamed])
-    return None if k is None else replace(unnamed[k], role="time")
 
 
 def _by_data(every: list[_Candidate]) -> list[_Candidate]:
@@ -282,9 +263,8 @@ def _required_keys(
         asked |= {"sample_time": "in seconds, between rows: no column is a time"} if table else {}
     elif not time.unit and time.value.size > 1:
         step = float(np.nanmedian(np.diff(time.value)))
-        if (
-            step >= 1 and np.nanmax(time.value) < MIN_TIMES_SINCE_1970[-1][0]
-        ):  # later times tell their unit
+        # Later times tell their unit.
+        if step >= 1 and np.nanmax(time.value) < MIN_TIMES_SINCE_1970[-1][0]:
             asked["time"] = f"its unit, {time.source}:ms or :us (it rises by {step:g} a row)"
     return asked
 
@@ -312,20 +292,16 @@ def _from_file(recording: Recording) -> Proposal | None:
 
 def _select_untestable(voltages: list[_Candidate], motions: list[_Candidate]) -> list[_Candidate]:
     """Return a voltage that changes less often than a test needs, and a motion, by their names."""
-    seldom = [c for c in voltages if c.value.size and _changes(c) < drives.LAGS]
+    seldom = [c for c in voltages if np.count_nonzero(np.diff(c.value)) < drives.LAGS]
     moving = [
         c for role in names.MOTIONS for c in motions if c.role == role and np.ptp(c.value) > 0
     ]
     return [seldom[0], moving[0]] if seldom and moving else []
 
 
-def _changes(voltage: _Candidate) -> int:
-    return int(np.count_nonzero(np.diff(voltage.value)))
-
-
 def _remark_on_unconfirmed(voltage: _Candidate) -> str:
     """Return the remark on a voltage that the data cannot confirm."""
-    times = _changes(voltage)
+    times = np.count_nonzero(np.diff(voltage.value))
     how = f"changes {times} time{'s' * (times > 1)} only" if times else "is constant"
     untold = "so the data cannot confirm that it drives the motor"
     return f"{voltage.source} {how}, {untold}; it was chosen by its name alone"
@@ -395,20 +371,17 @@ def _candidates(
         there = table.present.get(path)
         kept = np.isfinite(value) & (True if there is None else there)
         wheel = names.wheel_of(f"{offer.topic}.{path}")
-        if not (role == "voltage" and _is_supply(path, value[kept])):
-            role, times = _check_count(role, value[kept]), at.astype(np.float64)[kept]
-            yield _Candidate(role, wheel, "", offer, path, times, value[kept])
+        value, times = value[kept], at.astype(np.float64)[kept]
+        whole = np.array_equal(value, np.rint(value))
+        role = "position" if role == "count" and not whole else role
+        if not (role == "voltage" and _is_supply(path, value)):
+            yield _Candidate(role, wheel, "", offer, path, times, value)
 
 
 def _find_wrap(angle: Array) -> float:
     """Return the turn at which an angle wraps, in radians or degrees; 0 if it does not."""
     span, jump = np.ptp(angle) if angle.size else 0.0, np.abs(np.diff(angle)).max(initial=0.0)
     return next((turn for turn in (2 * np.pi, 360.0) if span <= turn and jump > turn / 2), 0.0)
-
-
-def _check_count(role: str, value: Array) -> str:
-    """Return the role of a possible count: only whole numbers are counts."""
-    return "position" if role == "count" and not np.array_equal(value, np.rint(value)) else role
 
 
 def _is_supply(name: str, value: Array) -> bool:

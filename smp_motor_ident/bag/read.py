@@ -203,7 +203,7 @@ def _records(recording: Recording, asked: SignalMap, types: Types) -> list[Recor
 def _plans(recording: Recording, asked: SignalMap, channels: list[Channel]) -> dict[str, MotorMap]:
     """Return the signals of every wheel, mapped by the user or given by our own messages."""
     topics = {channel.topic for channel in channels}
-    if asked.has_signals:
+    if any(motor.signals for motor in asked.motors.values()):
         plans = {
             wheel: resolve_signals(plan, channels)
             for wheel, plan in asked.motors.items()

@@ -12,7 +12,6 @@ from smp_motor_ident.bag.source import find_recordings
 from smp_motor_ident.bag.storage import Batch, Channel
 from smp_motor_ident.bag.unpack import decompress_messages
 from smp_motor_ident.errors import BagError
-from smp_motor_ident.finding import Finding
 
 Entry = tuple[int, int, Batch, int]
 
@@ -30,11 +29,7 @@ class Replay:
             raise BagError(f"{path}: is a table, not a bag")
         channels = self._recording.channels()
         self.channels = list({(c.topic, c.type): c for c in channels}.values())
-
-    @property
-    def findings(self) -> list[Finding]:
-        """Findings on missing or damaged parts."""
-        return self._recording.findings
+        self.findings = self._recording.findings  # on missing or damaged parts
 
     def messages(
         self, wanted: Callable[[Channel], bool] = lambda _: True

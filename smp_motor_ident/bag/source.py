@@ -282,7 +282,11 @@ def _bag(path: Path) -> Recording:
         given = msgspec.convert(load_bounded_yaml(text, _LOADER), _Metadata)
         information = given.rosbag2_bagfile_information
         listed = [Path(file).name for file in information.relative_file_paths]
-        bag.declared = _declared(information)
+        counts: Counter[str] = Counter()
+        for entry in information.topics_with_message_count or ():
+            if (topic := entry.topic_metadata or entry.topic_and_type) is not None:
+                counts[topic.name] += entry.message_count
+        bag.declared = dict(counts)
     except (yaml.YAMLError, ValueError, OSError, ArithmeticError) as error:
         reason = " ".join(str(error).split())[:200] or type(error).__name__
         bag.findings.append(
@@ -309,12 +313,3 @@ def _bag(path: Path) -> Recording:
         reason = bag.findings[-1].message if bag.findings else "holds no .mcap or .db3"
         raise BagError(f"{path}: {reason}")
     return bag
-
-
-def _declared(information: _Information) -> dict[str, int]:
-    """Return the messages by topic."""
-    counts: Counter[str] = Counter()
-    for entry in information.topics_with_message_count or ():
-        if (topic := entry.topic_metadata or entry.topic_and_type) is not None:
-            counts[topic.name] += entry.message_count
-    return dict(counts)

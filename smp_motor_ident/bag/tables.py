@@ -43,19 +43,15 @@ def is_time_of_part(path: str) -> bool:
 
 def resolve_signals(plan: MotorMap, channels: list[Channel]) -> MotorMap:
     """Return a plan whose signals name topics and fields as the files do."""
-    signals = {name: _of_topic(signal, channels) for name, signal in plan.signals.items()}
+    signals = dict(plan.signals)
+    for name, signal in plan.signals.items():
+        for topic in (c.topic for c in channels if not signal.topic and c.topic.startswith("/")):
+            if signal.field.startswith(f"{topic}."):  # its whole name was in quotes
+                signals[name] = replace(signal, topic=topic, field=signal.field[len(topic) + 1 :])
+                break
     if tables := [channel for channel in channels if channel.encoding == TABLE]:
         signals = {name: _resolved(name, signal, tables) for name, signal in signals.items()}
     return replace(plan, signals=signals)
-
-
-def _of_topic(signal: Signal, channels: list[Channel]) -> Signal:
-    """Return a signal whose whole name was in quotes with its topic, where one begins so."""
-    for channel in channels if not signal.topic else ():
-        _, begins, field = signal.field.partition(f"{channel.topic}.")
-        if channel.topic.startswith("/") and begins and (not _):
-            return replace(signal, topic=channel.topic, field=field)
-    return signal
 
 
 def _resolved(name: str, signal: Signal, tables: list[Channel]) -> Signal:

@@ -50,7 +50,8 @@ def measure_delay(path: Path) -> dict[str, TransportDelay]:
     """Measure the delay of every wheel's loop with enough commands in a bag."""
     found: dict[str, TransportDelay] = {}
     for recording in source.find_recordings([path]):
-        found |= _of_recording(recording)
+        if not recording.is_table:
+            found |= _of_bag(recording)
     if not found:
         raise BagError(
             f"{path}: no wheel with {MIN_COMMANDS} motor_command that answer a motor_state; "
@@ -59,9 +60,7 @@ def measure_delay(path: Path) -> dict[str, TransportDelay]:
     return found
 
 
-def _of_recording(recording: source.Recording) -> dict[str, TransportDelay]:
-    if recording.is_table:
-        return {}
+def _of_bag(recording: source.Recording) -> dict[str, TransportDelay]:
     kinds = {channel.topic: channel.type for channel in recording.channels()}
     pairs = {}
     for topic, kind in kinds.items():

@@ -86,15 +86,13 @@ class Types:
             if not found or not found[0].is_file():
                 raise BagError(f"{path}: no .msg file there")
             for file in found:
-                self._give(file)
-
-    def _give(self, file: Path) -> None:
-        folder = file.resolve().parent
-        package = folder.parent.name if folder.name == "msg" else folder.name
-        try:
-            self._given.update(_parse(file.read_text(), f"{package}/msg/{file.stem}", "ros2msg"))
-        except (TypesysError, OSError, ValueError, RecursionError) as error:
-            raise BagError(f"{file}: not a message definition ({first_line(error)})") from None
+                folder = file.resolve().parent
+                name = f"{(folder.parent if folder.name == 'msg' else folder).name}/msg/{file.stem}"
+                try:
+                    self._given.update(_parse(file.read_text(), name, "ros2msg"))
+                except (TypesysError, OSError, ValueError, RecursionError) as error:
+                    reason = f"not a message definition ({first_line(error)})"
+                    raise BagError(f"{file}: {reason}") from None
 
     def candidates(self, channel: Channel) -> Iterator[Definitions]:
         """Yield possible definitions of the channel's type, the most trusted first; at least one.

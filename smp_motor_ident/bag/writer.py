@@ -84,11 +84,6 @@ class BagWriter:
 
     The folder must not exist.  A kill of the process loses at most the messages of the last
     ``flush_period`` [s]; after many hours, those of some seconds.
-
-    Examples
-    --------
-    >>> with BagWriter(path) as bag:                              # doctest: +SKIP
-    ...     bag.write("/pwm", "std_msgs/msg/Float64", data, stamp_ns)
     """
 
     def __init__(
@@ -221,7 +216,10 @@ class BagWriter:
             whole = bytes(draft.data)
             del draft.data[kept:]
             try:
-                self._write_all(whole, draft.begin)
+                view, position = memoryview(whole), draft.begin
+                while view:
+                    done = os.pwrite(self._file.fileno(), view, position)
+                    view, position = view[done:], position + done
                 draft.begin += kept
                 draft.data.clear()
                 self._write_metadata()
@@ -229,12 +227,6 @@ class BagWriter:
                 raise BagError(f"{self.path}: cannot be written ({error.strerror})") from None
             self._flushed = time.monotonic()
             self._period = max(self._flush_period, (self._flushed - begun) / MAX_FLUSH_SHARE)
-
-    def _write_all(self, data: bytes, position: int) -> None:
-        view = memoryview(data)
-        while view:
-            done = os.pwrite(self._file.fileno(), view, position)
-            view, position = view[done:], position + done
 
     def _write_metadata(self) -> None:
         """Write metadata.yaml to a temporary file, then rename it."""

@@ -68,21 +68,19 @@ class _Way:
         level = min(level, 0.5 * (abs(start) + self.limit))
         while tape.turned(first) >= TURNED_COUNTS:
             before = len(tape.rows)
-            self.phase("hold", _constant(sign * level), MAX_HOLD_S, self._steady(before))
+            self._hold(sign * level)
             if level >= self.limit or answers_well(level, abs(start), tape.turned(before)):
                 break
             level = min(LEVEL_RATIO * level, self.limit)
         self.phase("coast", lambda t: 0.0, COAST, None)
 
-    def _steady(self, since: int) -> Callable[[], bool]:
-        """Return whether the wheel has settled since a row."""
-        tape = self.test.tapes[self.wheel]
-
-        return lambda: has_settled(Trace.of(tape.rows[since:]))
-
-
-def _constant(voltage: float) -> Callable[[float], float]:
-    return lambda t: voltage
+    def _hold(self, voltage: float) -> None:
+        """Hold a voltage until the wheel has has_settled."""
+        rows = self.test.tapes[self.wheel].rows
+        since = len(rows)
+        self.phase(
+            "hold", lambda t: voltage, MAX_HOLD_S, lambda: has_settled(Trace.of(rows[since:]))
+        )
 
 
 def check_wheels(

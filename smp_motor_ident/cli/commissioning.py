@@ -18,7 +18,7 @@ from smp_motor_control import WHEELS
 from smp_motor_control.motor.file import load_motors
 from smp_motor_control.wheel.protection import Bounds
 from smp_motor_ident import bag
-from smp_motor_ident.cli import checking, commission, driving, plan, protocol, steps, verifying
+from smp_motor_ident.cli import checking, commission, driving, plan, protocol, steps
 from smp_motor_ident.cli.processes import ProcessError, Processes, connect
 from smp_motor_ident.cli.protocol import Protocol
 from smp_motor_ident.commission import validation_run, wheel_limits, winding
@@ -62,7 +62,11 @@ def work(arguments: argparse.Namespace) -> int:
     folder = _checked(arguments)
     known = load_motors(arguments.motors) if arguments.motors else {}
     begun = Protocol(folder, arguments.accept)
-    _as_begun(arguments, begun.document)
+    # What the arguments leave open is as in the run that is resumed, else the defaults.
+    earlier = begun.document.get("asked", {})
+    arguments.wheel = arguments.wheel or earlier.get("wheels")
+    arguments.amplitude = arguments.amplitude or earlier.get("amplitude", AMPLITUDE)
+    arguments.duration = arguments.duration or earlier.get("duration", DURATION)
     if arguments.dry_run:
         wheels = arguments.wheel or WHEELS
         print("\n".join(plan.draw_plan(arguments.amplitude, arguments.duration, wheels)))
@@ -72,14 +76,6 @@ def work(arguments: argparse.Namespace) -> int:
     finally:
         if folder.is_dir() and not (folder / protocol.NAME).exists():
             shutil.rmtree(folder)  # it has only logs, the wheels never moved
-
-
-def _as_begun(arguments: argparse.Namespace, document: dict[str, Any]) -> None:
-    """Fill in missing arguments from the run that is resumed, else the defaults."""
-    earlier = document.get("asked", {})
-    arguments.wheel = arguments.wheel or earlier.get("wheels")
-    arguments.amplitude = arguments.amplitude or earlier.get("amplitude", AMPLITUDE)
-    arguments.duration = arguments.duration or earlier.get("duration", DURATION)
 
 
 def _commission(arguments: argparse.Namespace, folder: Path, known: Mapping[str, Any]) -> int:
@@ -231,7 +227,8 @@ def _design(session: Session) -> driving.Designed:
     estimates = _identify(session, plan.IDENTIFYING)
     more = None if known else plan.plan_further(estimates, arguments.amplitude)
     if more:
-        session.schedule.add_further(more, len(robot.wheels))
+        session.schedule.add(more.part, "signal", more.excitation.duration + plan.START)
+        session.schedule.add(plan.AGAIN, "identify", plan.COMPUTE * len(robot.wheels))
         _record(session, more)
         estimates = _identify(session, plan.AGAIN)
     if not made.has("judged"):
@@ -277,19 +274,19 @@ def _verify(session: Session, designed: driving.Designed) -> str:
     robot, made = session.robot, session.protocol
     robot.client.refuse_second_reporters(robot.wheels)
     session.schedule.add(
-        plan.DRIVING, "drive", plan.START + sum(one[2] for one in verifying.plan_of(designed))
+        plan.DRIVING, "drive", plan.START + sum(one[2] for one in driving.plan_of(designed))
     )
     session.begin(plan.DRIVING)
     own = robot.uncontrolled()
     try:
         robot.start_controllers(own)
-        with verifying.on_trial(robot.client, designed.gains) as trial:
-            changes, findings = verifying.drive_undisturbed(robot, designed, _say)
+        with driving.on_trial(robot.client, designed.gains) as trial:
+            changes, findings = driving.drive_undisturbed(robot, designed, _say)
             made.changes(changes)
             refused = made.add("verification", findings)
             trial.kept = session.arguments.apply and not refused
     finally:
-        robot.stop_controllers(own)
+        robot.processes.stop(*(f"{wheel}.wheel_pid" for wheel in own))
     if refused:
         print("the gains were taken back")
         refused += made.warned_of({f.evidence.get("wheel") for f in refused})

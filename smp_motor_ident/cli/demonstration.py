@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from smp_motor_control import LEFT, RIGHT, WHEELS, controller_of
-from smp_motor_control.motor.file import find_paper_motors, load_motors
+from smp_motor_control.motor.file import PAPER_MOTORS, find_config, load_motors
 from smp_motor_control.nodes import loopback
 from smp_motor_ident.cli import demo, driving, plan, steps, verdict
 from smp_motor_ident.cli.processes import Processes, connect, free_domain
@@ -48,7 +48,7 @@ def work(arguments: argparse.Namespace) -> int:
     def say(text: str) -> None:
         print(f"[{time.monotonic() - begun:5.1f} s] {text}", flush=True)
 
-    motors = Path(arguments.motors) if arguments.motors else find_paper_motors()
+    motors = Path(arguments.motors) if arguments.motors else find_config(PAPER_MOTORS)
     truth = load_motors(motors, WHEELS)
     folder = _fresh(Path(arguments.output))
     domain = free_domain() if arguments.domain is None else arguments.domain

@@ -169,7 +169,7 @@ def progress(program: str, quiet: bool = False) -> Iterator[Callable[..., None]]
 
 @contextmanager
 def _lines(program: str) -> Iterator[Callable[..., None]]:
-    """Print each step that is still going on after :data:`PATIENCE`, once."""
+    """Print each step that is still going on after :data:`TIMEOUT_S`, once."""
     steps: list[tuple[str, float]] = []
     over = threading.Event()
 

@@ -74,27 +74,23 @@ def plan_further(estimates: Mapping[str, Estimate], amplitude: float) -> Recordi
     Open is what gains are designed from: parameters and combinations that the data give, known to
     less than the accuracy wanted.  Of several wheels the one that needs the longest decides.
     """
-    wanting = [one for one in estimates.values() if _open(one)]
-    if not wanting:
-        return None
     proposals = [
         what_next(one, REQUIRED_ACCURACY.value, supply=amplitude, longest=MAX_FURTHER_S)
-        for one in wanting
+        for one in estimates.values()
+        if _is_open(one)
     ]
+    if not proposals:
+        return None
     longest = max(proposals, key=lambda one: one.duration)
     signal = Excitation("fourier", longest.duration, longest.amplitude, longest.band)
     return Recording(FITTED, FURTHER, signal)
 
 
-def _open(estimate: Estimate) -> list[str]:
+def _is_open(estimate: Estimate) -> bool:
     known = {**estimate.parameters, **estimate.combinations}
-    return [
-        name
-        for name in ("dc_gain", "time_constant", "resistance", "motor_constant", "inertia")
-        if (one := known.get(name)) is not None
-        and one.value
-        and (one.std or 0.0) > REQUIRED_ACCURACY.value * abs(one.value)
-    ]
+    names = ("dc_gain", "time_constant", "resistance", "motor_constant", "inertia")
+    given = (one for name in names if (one := known.get(name)) is not None and one.value)
+    return any((q.std or 0.0) > REQUIRED_ACCURACY.value * abs(q.value or 0.0) for q in given)
 
 
 class Schedule:
@@ -102,18 +98,6 @@ class Schedule:
 
     Parts of a kind are late alike: the time left is the planned one and, for each part, the mean
     excess of the parts of its kind that are done.
-
-    Examples
-    --------
-    >>> now = 0.0
-    >>> schedule = Schedule(lambda: now)
-    >>> for name in ("one", "two", "three"):
-    ...     schedule.add(name, "test", 10.0)
-    >>> schedule.begin("one")
-    '[1/3] one; about 30 s left'
-    >>> now = 15.0
-    >>> schedule.begin("two")
-    '[2/3] two; about 30 s left'
     """
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
@@ -125,11 +109,6 @@ class Schedule:
     def add(self, name: str, kind: str, seconds: float) -> None:
         """Plan a part, or plan it anew."""
         self._parts[name] = kind, seconds
-
-    def add_further(self, one: Recording, wheels: int) -> None:
-        """Plan one more recording, and an identification after it."""
-        self.add(one.part, "signal", one.excitation.duration + START)
-        self.add(AGAIN, "identify", COMPUTE * wheels)
 
     def begin(self, name: str, how: str = "") -> str:
         """End the part under way and begin a planned one; return it and the time left in words."""

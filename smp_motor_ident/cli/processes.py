@@ -50,7 +50,11 @@ def free_domain(first: int = 215, last: int = 232) -> int:
     count = last - first + 1
     for k in range(count):
         domain = first + (os.getpid() + k) % count
-        if _claim(domain) and _port_is_free(7400 + 250 * domain + 10):
+        if not _claim(domain):
+            continue
+        probe = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        with probe, contextlib.suppress(OSError):
+            probe.bind(("", 7400 + 250 * domain + 10))
             return domain
     raise ProcessError(f"all ROS domains from {first} to {last} are in use; end one of their users")
 
@@ -68,15 +72,6 @@ def _claim(domain: int) -> bool:
         claim.close()
         return False
     _CLAIMS.append(claim)
-    return True
-
-
-def _port_is_free(port: int) -> bool:
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-        try:
-            probe.bind(("", port))
-        except OSError:
-            return False
     return True
 
 
@@ -126,15 +121,12 @@ class Processes:
         interruption.check()
         for name, process in self._running.items():
             if name != but and process.poll() is not None:
+                log = self._logs / f"{name}.log"
+                lines = log.read_text(errors="replace").strip().splitlines() if log.exists() else []
                 raise ProcessError(
-                    f"{name} ended with exit code {process.returncode}: {self.last_words(name)}"
+                    f"{name} ended with exit code {process.returncode}: "
+                    f"{lines[-1] if lines else 'it said nothing'} (log: {log})"
                 )
-
-    def last_words(self, name: str) -> str:
-        """Return the last line that a process logged."""
-        path = self._logs / f"{name}.log"
-        lines = path.read_text(errors="replace").strip().splitlines() if path.exists() else []
-        return f"{lines[-1] if lines else 'it said nothing'} (log: {path})"
 
     def wait(self, name: str, timeout: float) -> None:
         """Wait for a process that ends by itself."""
@@ -155,7 +147,10 @@ class Processes:
         for number, patience in ((signal.SIGINT, 5.0), (signal.SIGTERM, 2.0), (signal.SIGKILL, 5)):
             for process in group:
                 _signal(process, number)
-            if _ended(group, patience):
+            deadline = time.monotonic() + patience
+            while (alive := any(p.poll() is None for p in group)) and time.monotonic() < deadline:
+                time.sleep(0.02)
+            if not alive:
                 break
         for process in group:
             _signal(process, signal.SIGKILL)  # children that a node left in its group
@@ -186,12 +181,3 @@ def _prepare(parent: int, priority: int) -> None:
 def _signal(process: subprocess.Popen[bytes], number: int) -> None:
     with contextlib.suppress(ProcessLookupError):
         os.killpg(process.pid, number)
-
-
-def _ended(group: Sequence[subprocess.Popen[bytes]], patience: float) -> bool:
-    deadline = time.monotonic() + patience
-    while any(process.poll() is None for process in group):
-        if time.monotonic() > deadline:
-            return False
-        time.sleep(0.02)
-    return True

@@ -124,7 +124,8 @@ class Protocol:
     def write(self) -> None:
         """Write both files, or none."""
         self.document["date"] = now()
-        shown = page.render(self.document, self._changes, self.results(), self._parameters())
+        gains = (self._folder / "gains.yaml").read_text("utf-8") if self.has("tuned") else ""
+        shown = page.render(self.document, self._changes, self.results(), gains)
         files = {self._folder / NAME: to_json(self.document), self._folder / REPORT: shown}
         write_together(files, force=True)
 
@@ -145,7 +146,3 @@ class Protocol:
         for k, wheel in enumerate(self.document["wheels"]):
             told = (f"{row.name} {row.cells[k]} {row.unit}" for row in rows)
             yield f"{wheel}: {', '.join(told)}"
-
-    def _parameters(self) -> str:
-        """Return the parameter file of the wheels' controllers, empty without gains."""
-        return (self._folder / "gains.yaml").read_text("utf-8") if self.has("tuned") else ""

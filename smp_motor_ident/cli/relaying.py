@@ -15,7 +15,7 @@ from smp_motor_ident.cli.processes import connect
 from smp_motor_ident.errors import DesignError, ParameterError
 from smp_motor_ident.report.document import check_free, write_together
 from smp_motor_ident.tune.methods.relay import read_oscillation
-from smp_motor_ident.tune.methods.ziegler_nichols import by_rule
+from smp_motor_ident.tune.methods.rules import by_rule
 
 BIAS_SHARE = 0.4
 """Share of the supply around which the relay switches, so that friction is not crossed."""

@@ -34,10 +34,6 @@ class Robot:
     ros_arguments: tuple[str, ...] = ()
     bounds: Mapping[str, object] = field(default_factory=dict)  # parameters of ``excite``
 
-    def wheel_nodes(self) -> list[str]:
-        """Return the names of the wheels' controllers."""
-        return [controller_of(wheel) for wheel in self.wheels]
-
     def uncontrolled(self) -> list[str]:
         """Return the wheels that no ``wheel_pid`` controls."""
         return [wheel for wheel in self.wheels if not self.client.runs_controller(wheel)]
@@ -53,13 +49,9 @@ class Robot:
         self.client.wait_for_nodes(nodes, TIMEOUT_S)
         self.client.change_states(nodes, "configure")
 
-    def stop_controllers(self, wheels: Sequence[str]) -> None:
-        """Stop the controllers that were started here."""
-        self.processes.stop(*(f"{wheel}.wheel_pid" for wheel in wheels))
-
     def switch(self, transition: str) -> None:
         """Apply a lifecycle transition to every wheel's controller."""
-        self.client.change_states(self.wheel_nodes(), transition)
+        self.client.change_states([controller_of(wheel) for wheel in self.wheels], transition)
 
 
 TIMEOUT_S = 60.0  # how long a busy machine may take to start or end a process [s]

@@ -89,10 +89,7 @@ def show(
 def check_estimates(
     truth: Mapping[str, MotorEntry], estimates: Mapping[str, Estimate]
 ) -> list[Check]:
-    """Check the identified motors against the limits.
-
-    A deviation is random, with that of the instants at which a running loop reads.
-    """
+    """Check the identified motors against the limits."""
     gain, deviation = [], []
     beyond = set()
     for wheel in estimates:

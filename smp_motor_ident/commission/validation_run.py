@@ -35,11 +35,7 @@ class Simulated:
 
 
 def judge(wheel: str, fitted: Sequence[Simulated], held_out: Sequence[Simulated]) -> Finding:
-    """Compare the errors on held-out data with those on the fitted data.
-
-    The finding is a note that states the fit; it is refused if the error is significantly larger
-    than that of the fitted data, and large enough to matter.
-    """
+    """Return the fit to held-out data, refused if it is significantly and clearly worse."""
     before = np.concatenate([one.powers() for one in fitted])
     after = np.concatenate([one.powers() for one in held_out])
     speed = np.concatenate([one.measured for one in held_out])

@@ -3,7 +3,7 @@
 
 import itertools
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from typing import Literal
 
@@ -102,7 +102,8 @@ def has_settled(hold: Trace) -> bool:
     there = _held(hold)
     time, count = there.time, there.count
     span = float(np.ptp(time)) if time.size > 8 else 0.0
-    if span < MIN_HOLD_S or not _arrived(there):
+    command, voltage = (float(np.median(x[-8:])) for x in (there.command, there.voltage))
+    if span < MIN_HOLD_S or abs(voltage - command) > MAX_SUPPLY_SHORTFALL.value * abs(command):
         return False
     thirds = np.interp(time[0] + span * np.arange(1, 4) / 3, time, count)
     before, last = np.abs(np.diff(thirds))
@@ -118,12 +119,6 @@ def _held(hold: Trace) -> Trace:
     return hold if hold.time.size - begin < 8 else hold.since(begin)
 
 
-def _arrived(held: Trace) -> bool:
-    """Tell whether the reported voltage equals the command within the tolerance of the supply."""
-    command, voltage = (float(np.median(x[-8:])) for x in (held.command, held.voltage))
-    return abs(voltage - command) <= MAX_SUPPLY_SHORTFALL.value * abs(command)
-
-
 def figures(trace: Trace, phases: Sequence[Phase], hardware: Hardware) -> Figures:
     """Evaluate the test of one wheel, by its speeds from counts in its own phases."""
     steps = np.diff(trace.time)
@@ -133,6 +128,11 @@ def figures(trace: Trace, phases: Sequence[Phase], hardware: Hardware) -> Figure
     starts = [_breakaway(trace.during(p.number)) for p in phases if p.kind == "ramp"]
     rest = trace.during(*(p.number for p in phases if p.kind == "rest"))
     gain, friction = _line([s.voltage for s in steady], [s.speed for s in steady])
+    applied: Iterable[float] = (s.voltage / level for s, level in zip(steady, levels))
+    if not holds:  # it never turned
+        ramps = trace.during(*(p.number for p in phases if p.kind == "ramp"))
+        late = np.abs(ramps.command) > 0.5 * np.abs(ramps.command).max(initial=0.0)
+        applied = ramps.voltage[late] / ramps.command[late]
     signs = [math.copysign(1.0, s.speed * level) for s, level in zip(steady, levels) if s.speed]
     return Figures(
         rate=1.0 / float(np.median(steps)) if steps.size and np.median(steps) > 0 else math.nan,
@@ -141,9 +141,7 @@ def figures(trace: Trace, phases: Sequence[Phase], hardware: Hardware) -> Figure
         at_rest=float(np.ptp(rest.count)) if rest.time.size else 0.0,
         breakaway=max(starts) if starts and np.all(np.isfinite(starts)) else math.nan,
         direction=float(np.sign(sum(signs))),
-        applied=_median(s.voltage / level for s, level in zip(steady, levels))
-        if holds
-        else _applied(trace.during(*(p.number for p in phases if p.kind == "ramp"))),
+        applied=_median(applied),
         velocity_ratio=_median(s.reported / s.wheel for s in steady if s.wheel),
         gain=gain,
         friction=friction,
@@ -209,12 +207,6 @@ def _breakaway(ramp: Trace) -> float:
     return float(abs(ramp.command[still[-1]]))
 
 
-def _applied(ramps: Trace) -> float:
-    """Return the reported over the commanded voltage of a wheel that never turned."""
-    late = np.abs(ramps.command) > 0.5 * np.abs(ramps.command).max(initial=0.0)
-    return _median(ramps.voltage[late] / ramps.command[late])
-
-
 def _coast(hold: Trace, coast: Trace, hardware: Hardware) -> float:
     steady, free = _Steady.of(hold, hardware), _held(coast)
     if not steady.speed or free.time.size < 2:
@@ -235,6 +227,6 @@ def _line(voltages: Sequence[float], speeds: Sequence[float]) -> tuple[float, fl
     return (float(gain), float(-offset / gain)) if gain > 0 else (math.nan, math.nan)
 
 
-def _median(values: object) -> float:
-    known = [v for v in values if math.isfinite(v)]  # type: ignore[attr-defined]
+def _median(values: Iterable[float]) -> float:
+    known = [v for v in values if math.isfinite(v)]
     return float(np.median(known)) if known else math.nan

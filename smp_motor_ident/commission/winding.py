@@ -79,9 +79,7 @@ def resistance(record: Record) -> Resistance | None:
 
 
 def report_heated_winding(wheel: str, earlier: Sequence[Record], last: Record) -> list[Finding]:
-    """Return whether a winding is too much hotter than in the earlier recording with the most
-    accurate resistance.
-    """
+    """Return a finding where a winding is much hotter than in the best earlier recording."""
     known = [r for one in earlier if (r := resistance(one)) is not None and r.value > 0]
     now = resistance(last)
     if not known or now is None:

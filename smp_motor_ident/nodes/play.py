@@ -25,9 +25,7 @@ from smp_motor_ident.nodes.bag_arguments import chosen, message_class, quality
 DEPTH = 1000
 DISCOVERY_TIME_S = 1.0
 """Shortest wait [s] before the first message, so that subscribers find the publishers."""
-FIRST_SUBSCRIBER_TIMEOUT_S = (
-    3.0  # longest wait [s] for a first subscriber, where nobody listens yet
-)
+FIRST_SUBSCRIBER_TIMEOUT_S = 3.0  # longest wait [s] for a first subscriber
 CONNECTION_TIMEOUT_S = 5.0  # longest wait [s] until everybody whom the graph shows is connected
 
 

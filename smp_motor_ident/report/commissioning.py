@@ -14,7 +14,7 @@ import numpy as np
 from smp_motor_control.arrays import Array
 from smp_motor_ident.finding import SEVERITIES
 from smp_motor_ident.report import words
-from smp_motor_ident.report.chart import Chart, Curve
+from smp_motor_ident.report.drawing import Chart, Curve
 from smp_motor_ident.report.templates import page
 from smp_motor_ident.result import Estimate, Quantity
 

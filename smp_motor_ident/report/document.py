@@ -23,6 +23,7 @@ from smp_motor_ident.result import Estimate, Quantity
 SCHEMA = 1
 MAX_VALUE = 1e12
 """No number of a motor is larger in SI units; squares of larger ones leave the floats."""
+Rows = list[list[float]]
 POSITIVE_QUANTITIES = ("resistance", "inductance", "motor_constant", "inertia", "dc_gain")
 
 
@@ -84,7 +85,9 @@ def _motor(wheel: str, entry: Any, path: Path) -> Estimate:
         for group in (given.get("parameters", {}), given.get("combinations", {})):
             for quantity in msgspec.convert(group, dict[str, dict[str, Any]]).values():
                 quantity["ci95"] = _interval(quantity.get("ci95"))
-        estimate = msgspec.convert(given, Estimate, dec_hook=_matrix)
+        estimate = msgspec.convert(
+            given, Estimate, dec_hook=lambda _, rows: np.array(msgspec.convert(rows, Rows), float)
+        )
         _check(estimate)
         return estimate
     except (msgspec.ValidationError, ValueError) as error:
@@ -96,10 +99,6 @@ def _interval(bounds: Any) -> Any:
     if not isinstance(bounds, list) or len(bounds) != 2:
         return bounds
     return [end if one is None else one for one, end in zip(bounds, (-math.inf, math.inf))]
-
-
-def _matrix(kind: Any, value: Any) -> Any:
-    return np.array(msgspec.convert(value, list[list[float]]), dtype=np.float64)
 
 
 def _check(estimate: Estimate) -> None:

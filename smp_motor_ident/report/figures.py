@@ -8,7 +8,7 @@ from typing import Literal
 import numpy as np
 
 from smp_motor_control.arrays import Array
-from smp_motor_ident.report.chart import Chart, Curve, thin
+from smp_motor_ident.report.drawing import Chart, Curve, thin
 from smp_motor_ident.report.words import label
 from smp_motor_ident.result import ResidualTests
 
@@ -38,10 +38,7 @@ class Comparison:
 
 
 def fit_charts(wheel: str, parts: Sequence[Comparison], lag: float = 0.0) -> list[Chart]:
-    """Return speed, residual and voltage over all stretches of data, one after the other.
-
-    A screen shows at first where the speed moves most, over many of the motor's lags [s].
-    """
+    """Return speed, residual and voltage over all stretches; shown first is the liveliest part."""
     begin, times, spans = 0.0, [], []
     for part in parts:
         times.append(begin + part.time)
@@ -126,8 +123,9 @@ def frequency_charts(wheel: str, parts: Sequence[Comparison]) -> list[Chart]:
     charts = []
     for kind, unit, of, low, high in (
         ("gain", "rad/s/V", np.abs, np.exp(-spread), np.exp(spread)),
-        ("phase", "deg", _degrees, -np.rad2deg(spread), np.rad2deg(spread)),
-    ):
+        ("phase", "deg", lambda response: np.rad2deg(np.unwrap(np.angle(response))),
+         -np.rad2deg(spread), np.rad2deg(spread)),
+    ):  # fmt: skip
         y = of(measured)
         around = (y * low, y * high) if kind == "gain" else (y + low, y + high)
         curves = (
@@ -142,10 +140,6 @@ def frequency_charts(wheel: str, parts: Sequence[Comparison]) -> list[Chart]:
             summary=f"{kind.capitalize()} of {name} {span}.",
         ))  # fmt: skip
     return charts
-
-
-def _degrees(response: Array) -> Array:
-    return np.asarray(np.rad2deg(np.unwrap(np.angle(response))))
 
 
 def _without_pauses(part: Comparison, step: float) -> list[tuple[Array, ...]]:

@@ -16,7 +16,7 @@ import numpy as np
 
 from smp_motor_ident.errors import BagError
 from smp_motor_ident.live.monitor import Monitor
-from smp_motor_ident.report.chart import Chart, Curve
+from smp_motor_ident.report.drawing import Chart, Curve
 from smp_motor_ident.report.words import label
 
 SHOWN = {

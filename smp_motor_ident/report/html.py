@@ -8,8 +8,8 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 from smp_motor_ident.report import figures, summary, templates, words
-from smp_motor_ident.report.chart import Chart
 from smp_motor_ident.report.comparison import compare
+from smp_motor_ident.report.drawing import Chart
 from smp_motor_ident.report.figures import Comparison
 from smp_motor_ident.result import Estimate, Quantity
 
@@ -38,7 +38,12 @@ class Report:
 def render(report: Report) -> str:
     """Return the page."""
     motors = {wheel: _motor(estimate, report) for wheel, estimate in report.estimates.items()}
-    tuning_charts, tuning_data = _tuning_page(report.tunings)
+    tuning_charts, tuning_data = list[Chart](), dict[str, Any]()
+    if report.tunings:
+        from smp_motor_ident.report import tuning_page  # loads all of tune, which few reports need
+
+        tuning_charts = tuning_page.page_charts(report.tunings)
+        tuning_data = tuning_page.page_data(report.tunings)
     charts = [*tuning_charts, *(c for motor in motors.values() for c in motor["charts"])]
     return templates.page(
         "report.html.jinja",
@@ -51,14 +56,6 @@ def render(report: Report) -> str:
         comparisons=compare(report.estimates) if len(report.estimates) > 1 else (),
         motors=motors,
     )
-
-
-def _tuning_page(tunings: Mapping[str, Tuning]) -> tuple[list[Chart], dict[str, Any]]:
-    if not tunings:
-        return [], {}
-    from smp_motor_ident.report import tuning_page  # loads all of tune, which few reports need
-
-    return tuning_page.page_charts(tunings), tuning_page.page_data(tunings)
 
 
 def _motor(estimate: Estimate, report: Report) -> dict[str, Any]:

@@ -44,17 +44,13 @@ def _told(estimate: Estimate) -> list[str]:
 
 def find_doubted(estimate: Estimate) -> dict[str, int]:
     """Return the quantities that may be off by more than is stated, each with its message."""
-    doubted: dict[str, int] = {}
+    doubted, known = dict[str, int](), _told(estimate)
     for number, finding in enumerate(_by_severity(estimate), 1):
         if finding.severity in ("unreliable", "refused"):
-            doubted = {**dict.fromkeys(find_affected(finding, estimate), number), **doubted}
+            # One that names no quantity concerns all.
+            affected = [name for name in known if name in finding.quantities] or known
+            doubted = {**dict.fromkeys(affected, number), **doubted}
     return doubted
-
-
-def find_affected(finding: Finding, estimate: Estimate) -> list[str]:
-    """Return the quantities that a finding concerns, all where it names none."""
-    known = _told(estimate)
-    return [name for name in known if name in finding.quantities] or known
 
 
 def judge(estimate: Estimate) -> tuple[str, str]:

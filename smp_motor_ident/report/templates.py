@@ -11,8 +11,7 @@ import numpy as np
 from markupsafe import Markup
 
 from smp_motor_ident.report import words
-from smp_motor_ident.report.chart import Chart, packed
-from smp_motor_ident.report.drawing import svg
+from smp_motor_ident.report.drawing import Chart, packed, svg
 
 
 def page(name: str, charts: Sequence[Chart] | None = None, **content: Any) -> str:

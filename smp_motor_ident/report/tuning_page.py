@@ -13,7 +13,7 @@ import numpy as np
 from smp_motor_control.arrays import Array
 from smp_motor_ident.errors import SmpError
 from smp_motor_ident.report import drawing, words
-from smp_motor_ident.report.chart import Chart, Curve
+from smp_motor_ident.report.drawing import Chart, Curve
 from smp_motor_ident.result import Estimate
 from smp_motor_ident.tune import (
     METHODS,
@@ -86,10 +86,7 @@ def _refused(estimates: Mapping[str, Estimate], loops: Mapping[str, Loop]) -> di
 
 
 def tuning_of(estimate: Estimate, loop: Loop, own: Design) -> Tuning:
-    """Design one wheel's controller at every place of the sliders, around the design of ``tune``.
-
-    All change their set-point at its pace where that is common to several wheels.
-    """
+    """Design one wheel's controller at every place of the sliders, around that of ``tune``."""
     choices = [
         Choice(share * own.margins.crossover, margin, own, curves(estimate, own))
         if share == BANDWIDTH_SHARES[-1] and margin == DEFAULT_PHASE_MARGIN

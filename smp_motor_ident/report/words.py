@@ -95,17 +95,7 @@ def model(name: str) -> str:
 
 
 def number(value: float | None, std: float | None = None) -> str:
-    """Return a number with the digits that its standard deviation supports.
-
-    Examples
-    --------
-    >>> number(25.51832, 0.0123)
-    '25.518'
-    >>> number(1.13047e-6, 2e-9)
-    '1.1305e-06'
-    >>> number(None)
-    '—'
-    """
+    """Return a number with the digits that its standard deviation supports."""
     if value is None or not math.isfinite(value):
         return "—"
     digits = 5
@@ -128,17 +118,7 @@ def spread(std: float | None) -> str:
 
 
 def state(quantity: Quantity, with_unit: bool = True) -> str:
-    """Return a number with ± one standard deviation and unit, or the range that is left open.
-
-    Examples
-    --------
-    >>> state(Quantity(0.0381133, 0.0016, unit="s"))
-    '38.1 ± 1.6 ms'
-    >>> state(Quantity(1.39973e-5, 8.6e-9, unit="kg m^2"))
-    '(1.39973 ± 0.00086)·10⁻⁵ kg m²'
-    >>> state(Quantity(None, ci95=(0.0, 0.0525), unit="s", status="unidentifiable"))
-    '0 … 52.5 ms'
-    """
+    """Return a number with ± one standard deviation and unit, or the range that is left open."""
     shown = scaled(quantity)
     if shown.value is None:
         text = interval(quantity)
@@ -150,13 +130,7 @@ def state(quantity: Quantity, with_unit: bool = True) -> str:
 
 
 def interval(quantity: Quantity) -> str:
-    """Return the 95 % interval of a number, or the range that is left open, in the unit shown.
-
-    Examples
-    --------
-    >>> interval(Quantity(25.5, 0.1, (25.304, 25.696), "rad/s/V"))
-    '25.30 … 25.70'
-    """
+    """Return the 95 % interval of a number, or the range that is left open, in the unit shown."""
     shown = scaled(quantity)
     if shown.ci95 is None:
         return "—"
@@ -192,14 +166,7 @@ def _with_unit(text: str, unit: str) -> str:
 
 
 def systematic(quantity: Quantity) -> str:
-    """Return the systematic uncertainties of a number, each with its cause.
-
-    Examples
-    --------
-    >>> from smp_motor_ident.result import Share
-    >>> systematic(Quantity(12.9, 0.02, systematic=(Share("current_scale", 0.03, 0.39),)))
-    '± 3 % (current scale)'
-    """
+    """Return the systematic uncertainties of a number, each with its cause."""
     shown = scaled(quantity)
     signs = {-1: "−", 0: "± ", 1: "+"}
     words = [
@@ -258,17 +225,12 @@ def status(quantity: Quantity) -> str:
 
 
 def to_sentence(text: str) -> str:
-    """Return a message as a sentence, with the names of quantities in words.
-
-    Examples
-    --------
-    >>> to_sentence("the data do not tell time_constant")
-    'The data do not tell time constant.'
-    """
-    text = re.sub(r"\b[a-z]+(_[a-z]+)+\b(?!=)", _name_in_words, text.strip())
+    """Return a message as a sentence, with the names of quantities in words."""
+    known = {**EXPLAINED, **MODELS}
+    text = re.sub(
+        r"\b[a-z]+(_[a-z]+)+\b(?!=)",
+        lambda m: put_within(m[0]) if m[0] in known else m[0],
+        text.strip(),
+    )
     text = re.sub(r"^[a-z]+(?=[ ,;])", lambda m: m[0].capitalize(), text)
     return text if not text or text[-1] in ".!?" else f"{text}."
-
-
-def _name_in_words(found: re.Match[str]) -> str:
-    return put_within(found[0]) if found[0] in EXPLAINED or found[0] in MODELS else found[0]

@@ -3,16 +3,13 @@
 
 from smp_motor_ident.tune.designer import Design, compare, design, recommend
 from smp_motor_ident.tune.loop import Loop
-from smp_motor_ident.tune.margins import Margins
 from smp_motor_ident.tune.methods import METHODS
-from smp_motor_ident.tune.wheels import WheelSet, design_wheels
+from smp_motor_ident.tune.wheels import design_wheels
 
 __all__ = [
     "METHODS",
     "Design",
     "Loop",
-    "Margins",
-    "WheelSet",
     "compare",
     "design",
     "design_wheels",

@@ -105,7 +105,11 @@ def prepare(estimate: Estimate, loop: Loop, method: str, targets: dict[str, Any]
     lost = friction.planned + driver.threshold + load
     plant = sample(replace(motors_of(estimate), static_voltage=np.array([lost])), loop)
     problem = Problem(plant, loop, targets, unmodelled_dynamics(estimate))
-    required = _required(chosen, problem)
+    required = replace(
+        chosen.required,
+        phase=problem.target("phase_margin", chosen.required.phase),
+        sensitivity=problem.target("maximum_sensitivity", chosen.required.sensitivity, least=1.0),
+    )
     n = int(check_target(targets, "samples") or 1000)
     seed = int(check_target(targets, "seed", least=-1) or 0)
     # Eigenvalues cost with the cube of the states: fewer motors where a loop has many.
@@ -207,13 +211,3 @@ def _method(name: str, targets: dict[str, Any]) -> Method:
             f"the method {name!r} has no target {unknown[0]!r}; it has {', '.join(known)}"
         )
     return METHODS[name]
-
-
-def _required(method: Method, problem: Problem) -> RequiredMargins:
-    """Return the margins that the method requires unless the caller's targets set them."""
-    required = method.required
-    return RequiredMargins(
-        phase=problem.target("phase_margin", required.phase),
-        gain=required.gain,
-        sensitivity=problem.target("maximum_sensitivity", required.sensitivity, least=1.0),
-    )

@@ -30,7 +30,6 @@ from smp_motor_ident.tune.plant import Plant, sample
 from smp_motor_ident.tune.reference import Reference, controller_for, plan_reference
 from smp_motor_ident.tune.simulation import Controller
 from smp_motor_ident.tune.specification import Performance, Settling, Specification, figures_of
-from smp_motor_ident.tune.unmodelled import UnmodelledDynamics
 from smp_motor_ident.tune.unmodelled import describe_known_band as known_words
 
 
@@ -155,10 +154,7 @@ def finish(case: Case, feedback: Feedback, factor: float, robustness: Robustness
 
 
 def settles(case: Case, feedback: Feedback) -> bool:
-    """Tell whether a largest settling time can be stated.
-
-    The quickest change decides, so that the others need not be simulated.
-    """
+    """Tell whether a largest settling time can be stated: the quickest change decides."""
     controller = controller_for(case.problem.loop, feedback)
     margins = loop_margins(case.problem.plant, feedback)
     quickest = _plan(case, controller, margins)
@@ -279,7 +275,14 @@ def _explain(
         )
         # Beyond the crossover |T| is as large as the gains: so much of it the rule's had.
         if robustness.unmodelled > MIN_LIMITING_SHARE.value * min(factor, 1.0):
-            findings.append(_report_limited_gains(unmodelled))
+            findings.append(Finding(
+                "unmodelled_dynamics", "warning",
+                "the gains are limited because the motor's response is known only up to "
+                f"{unmodelled.known:.3g} rad/s",
+                {"known_frequency": unmodelled.known},
+                "for larger gains record a voltage that changes faster, such as a pseudo-random "
+                "binary one",
+            ))  # fmt: skip
     if figures.control_noise > 1.05 * loop.noise_limit:
         noisy = (
             f"measurement noise causes {figures.control_noise:.2g} V of control noise, and "
@@ -295,17 +298,6 @@ def _explain(
     return "; ".join(words), tuple(findings)
 
 
-def _report_limited_gains(unmodelled: UnmodelledDynamics) -> Finding:
-    return Finding(
-        "unmodelled_dynamics",
-        "warning",
-        "the gains are limited because the motor's response is known only up to "
-        f"{unmodelled.known:.3g} rad/s",
-        {"known_frequency": unmodelled.known},
-        "for larger gains record a voltage that changes faster, such as a pseudo-random binary one",
-    )
-
-
 def _sensor(case: Case) -> str:
     """Return averaging and lag of the reported speed in words."""
     plant, words = case.problem.plant, ""
@@ -317,10 +309,7 @@ def _sensor(case: Case) -> str:
 
 
 def compare(estimate: Estimate, loop: Loop, **targets: Any) -> dict[str, Design | DesignError]:
-    """Design by every method, each with the targets that it understands.
-
-    A method that cannot meet the targets is represented by its error.
-    """
+    """Return each method's design, with the targets that it understands, or its error."""
     results: dict[str, Design | DesignError] = {}
     for name in METHODS:
         known = (*COMMON_TARGETS, *METHODS[name].targets)

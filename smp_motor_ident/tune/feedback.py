@@ -10,8 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from smp_motor_control.arrays import Array, Complex
-from smp_motor_ident.tune.observer_model import SPEED
-from smp_motor_ident.tune.plant import Plant
+from smp_motor_ident.tune.plant import SPEED, Plant
 
 
 @dataclass(frozen=True)

@@ -1,8 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Thresholds for gains and loops, with units and reasons.
-
-Printed with the others in ``docs/limits.md``.
-"""
+"""Thresholds for gains and loops, with units and reasons."""
 
 from smp_motor_ident.infer.response_limits import RESONANCE_DAMPING
 from smp_motor_ident.limits import Limit

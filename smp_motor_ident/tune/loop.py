@@ -13,67 +13,31 @@ SPEED_SOURCES: tuple[SpeedSource, ...] = ("measured", "difference", "observer")
 
 @dataclass(frozen=True)
 class Loop:
-    """One wheel's speed loop: sampling, delay, encoder, gearbox and supply.
+    """One wheel's speed loop: sampling, delay, encoder, gearbox and supply."""
 
-    Attributes
-    ----------
-    sample_time : float
-        Interval of the controller's steps [s].
-    delay : float or None
-        From the stamp of a measurement to the instant at which the voltage answering it is
-        applied: computation and transport, beyond the hold [s].  None takes one sample, which
-        every node that answers within its period keeps.  A delay of the motor itself (that of
-        the estimate) is added to it.
-    usual_delay : float or None
-        The same as it usually is [s], for the timing of the reference, where ``delay`` is the
-        longest that the margins must bear.  None takes ``delay``: a driver whose loop has a
-        fixed rate applies at its next sample the last command in between.
-    delay_doubt : float
-        Increase of the delay that may not cause significant overshoot [s].
-    gear_ratio : float
-        Motor revolutions per wheel revolution [-].
-    counts_per_revolution : float or None
-        Encoder counts per motor revolution; None where speed is not made from counts.
-    supply_voltage : float
-        Largest voltage of either sign [V].
-    speed_source : {'measured', 'difference', 'observer'}
-        Source of the controlled speed: the speed in the message, counts differenced over
-        ``difference_window`` samples, or the observer's estimate.
-    difference_window : int
-        Samples over which the speed is averaged: by the controller for ``difference``, by the
-        hardware for ``measured`` (0: an instantaneous speed, as of a tachometer).
-    noise_voltage : float or None
-        Largest control noise [V rms] that the measurement may cause at the output;
-        None takes 4 % of the supply.
-    speed_noise : float
-        Standard deviation of the noise on a reported speed [rad/s, motor], its rounding included.
-    speed_step : float
-        Step in which a reported speed comes [rad/s, motor].
-    angle_noise : float
-        Standard deviation of the noise on the angle that the speed is made from [rad, motor],
-        in addition to quantisation.
-    averaging_given : bool
-        Whether ``difference_window`` holds for a reported speed whatever averaging was identified.
-
-    Raises
-    ------
-    ParameterError
-        When a value is not finite, has the wrong sign, or names no speed source.
-    """
-
-    sample_time: float = 0.005
+    sample_time: float = 0.005  # interval of the controller's steps [s]
+    # From the stamp of a measurement to the instant at which the voltage answering it is applied,
+    # beyond the hold and a delay of the motor itself [s]; None: one sample, which every node that
+    # answers within its period keeps
     delay: float | None = None
+    # The same as it usually is [s], for the timing of the reference, where ``delay`` is the longest
+    # that the margins must bear; None: ``delay``
     usual_delay: float | None = None
-    delay_doubt: float = 2e-3
-    gear_ratio: float = 65.5
+    delay_doubt: float = 2e-3  # more delay that may not cause significant overshoot [s]
+    gear_ratio: float = 65.5  # motor revolutions per wheel revolution [-]
+    # Of the encoder, per motor revolution; None where speed is not made from counts
     counts_per_revolution: float | None = 500.0
-    supply_voltage: float = 12.0
+    supply_voltage: float = 12.0  # largest voltage of either sign [V]
+    # The speed in the message, counts differenced over ``difference_window``, or the observer's
     speed_source: SpeedSource = "measured"
+    # Samples over which the speed is averaged: by the controller for ``difference``, by the
+    # hardware for ``measured`` (0: an instantaneous speed, as of a tachometer)
     difference_window: int = 1
-    noise_voltage: float | None = None
-    speed_noise: float = 0.0
-    speed_step: float = 0.0
-    angle_noise: float = 0.0
+    noise_voltage: float | None = None  # largest control noise [V rms]; None: 4 % of the supply
+    speed_noise: float = 0.0  # of a reported speed, with its rounding [rad/s rms, motor]
+    speed_step: float = 0.0  # in which a reported speed comes [rad/s, motor]
+    angle_noise: float = 0.0  # of the angle behind the speed, before counting [rad rms, motor]
+    # Whether ``difference_window`` holds for a reported speed whatever averaging was identified
     averaging_given: bool = False
 
     def __post_init__(self) -> None:

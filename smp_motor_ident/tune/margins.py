@@ -87,19 +87,11 @@ def loop_margins(plant: Plant, feedback: Feedback) -> Margins:
 
 def _refine(omega: Array, loop: Complex) -> Array:
     """Return the grid, 16 times finer where a margin is read."""
-    near = _crosses_unit_gain(loop) | _crosses_real_axis(loop)
+    near = _changes(np.abs(loop) > 1) | _changes(loop.imag > 0)
     closest = int(np.argmin(np.abs(1 + loop)))
     near[max(closest - 1, 0) : closest + 1] = True
     inner = omega[:-1][near, None] + np.diff(omega)[near, None] * np.arange(1, 16) / 16
     return np.sort(np.concatenate([omega, inner.ravel()]))
-
-
-def _crosses_unit_gain(loop: Complex) -> Flags:
-    return _changes(np.abs(loop) > 1)
-
-
-def _crosses_real_axis(loop: Complex) -> Flags:
-    return _changes(loop.imag > 0)
 
 
 def _changes(flags: Flags) -> Flags:
@@ -108,7 +100,7 @@ def _changes(flags: Flags) -> Flags:
 
 def batch_margins(loop: Complex, omega: Array) -> BatchMargins:
     """Return the margins of many loops from their frequency responses on a grid up to Nyquist."""
-    falls = _crosses_unit_gain(loop)
+    falls = _changes(np.abs(loop) > 1)
     size = np.log(np.maximum(np.abs(loop), TINY))
     share = size[:, :-1] / np.where(falls, size[:, :-1] - size[:, 1:], 1.0)
     # The angle from -180 deg: rotate by pi so that the principal value is the margin itself.
@@ -118,7 +110,7 @@ def batch_margins(loop: Complex, omega: Array) -> BatchMargins:
     phase = np.rad2deg(np.minimum(turn, np.abs(2 * np.pi - turn)).min(axis=1))
     delay = np.where(falls, turn / where, np.inf).min(axis=1)
     crossover = np.fmax.reduce(where, axis=1)  # NaN where there is none
-    crosses = _crosses_real_axis(loop)
+    crosses = _changes(loop.imag > 0)
     part = loop[:, :-1].imag / np.where(crosses, loop[:, :-1].imag - loop[:, 1:].imag, 1.0)
     real = loop[:, :-1].real + part * np.diff(loop.real, axis=1)
     # At Nyquist the response of a sampled loop is real: a crossing of its own.

@@ -11,11 +11,7 @@ from smp_motor_control.motor.parameters import COMBINATIONS, PHYSICAL
 from smp_motor_ident.errors import DesignError
 from smp_motor_ident.finding import Finding
 from smp_motor_ident.result import Estimate, Quantity
-from smp_motor_ident.tune.limits import (
-    MAX_FRICTION_ERROR,
-    MAX_FRICTION_RANGE,
-    MIN_UNRELIABLE_STD,
-)
+from smp_motor_ident.tune.limits import MAX_FRICTION_ERROR, MAX_FRICTION_RANGE, MIN_UNRELIABLE_STD
 
 SENSOR = ("delay", "averaging_window", "sensor_lag")
 """Delays between the motor's speed and the reported one, in s each."""
@@ -24,10 +20,6 @@ _ABSENT = (*SENSOR, "time_constant_product")
 """Quantities that are zero where an estimate does not state them."""
 
 _POSITIVE = ("dc_gain", "time_constant", "resistance", "inductance", "motor_constant", "inertia")
-
-
-def _zero() -> Array:
-    return np.zeros(1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,9 +34,9 @@ class Motors:
     delay: Array  # shape (n,), [s]: the motor's own delay, from applied voltage to reported speed
     static_voltage: Array  # shape (n,), [V]: Coulomb friction
     # shape (n,), [s]: over which the reported speed is averaged; 0 where none was identified
-    averaging_window: Array = field(default_factory=_zero)
+    averaging_window: Array = field(default_factory=lambda: np.zeros(1))
     # shape (n,), [s]: time constant of the filter of the reported speed
-    sensor_lag: Array = field(default_factory=_zero)
+    sensor_lag: Array = field(default_factory=lambda: np.zeros(1))
 
     def __len__(self) -> int:
         """Return the number of motors."""
@@ -230,9 +222,8 @@ def _covariance(estimate: Estimate, names: tuple[str, ...], mean: Array) -> Arra
     index = [estimate.names.index(names[k]) for k in known]
     covariance[np.ix_(known, known)] = estimate.covariance[np.ix_(index, index)]
     for one in estimate.systematic:
-        if (
-            one.cause != "low_passed_speed"
-        ):  # `move_lag_to_sensor` draws which of the two lags is the motor's
+        # `move_lag_to_sensor` draws which of the two lags is the motor's.
+        if one.cause != "low_passed_speed":
             move = np.array([one.moves.get(name, 0.0) for name in names])
             covariance += np.outer(move, move)
     spread = np.zeros(len(names))

@@ -6,27 +6,66 @@ one motor and a thousand draws of an uncertain one are the same few array operat
 speed is reported is part of it: filtered, averaged over a window, or observed.
 Everything here is at the motor shaft.
 
+The observer in the loop is a linear filter of angle and voltage.  Its angle only ever appears as
+its difference ``e`` from the counted one, so the filter has no state that grows.  With
+``r = (speed, acceleration, load)`` and, over one sample, the angle ``s`` that was swept and the
+mean voltage ``v``,
+
+    nu = e + s - F_0 r - G_0 v,   e <- (1 - K_0) nu,   r <- F r + G v + K nu
+
+which is ``state <- advance state + by_angle s + by_voltage v``.
+
 References
 ----------
 .. [1] K. J. Astrom, B. Wittenmark, Computer-Controlled Systems, 3rd ed. (1997), section 2.3:
    sampling of systems with time delay.
+.. [2] R. F. Stengel, Optimal Control and Estimation (1994), section 4.3: the steady-state Kalman
+   filter.
 """
 
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from smp_motor_control.arrays import Array, Complex
-from smp_motor_control.motor.model import MotorModel
+from smp_motor_control.motor.parameters import MotorModel
 from smp_motor_control.motor.response import zero_order_hold
-from smp_motor_control.observer import ObserverNoise
+from smp_motor_control.observer import ObserverNoise, prediction, steady_gain
 from smp_motor_ident.errors import DesignError
 from smp_motor_ident.tune.loop import Loop
 from smp_motor_ident.tune.motors import Motors
-from smp_motor_ident.tune.observer_model import ObserverModel, observer_model
 
 MAX_LOOP_SAMPLES = 300
 """Largest delay and averaging of a loop [samples]."""
+
+SPEED = 1
+"""Where the speed is in the state."""
+
+
+@dataclass(frozen=True, eq=False)
+class ObserverModel:
+    """The observer as a filter, which is the same for all motors of a batch."""
+
+    advance: Array  # shape (q, q)
+    # by_angle, by_voltage: shape (q,)
+    by_angle: Array
+    by_voltage: Array
+    # shape (m,): shares of the last controller outputs in the mean voltage of a sample, as the
+    # observer gets it and shifts it by the delay of its model
+    taps: Array
+    variance: float = 1.0  # of the innovation, as the observer takes it [rad^2]
+
+    def transfer(self, z: Complex) -> tuple[Complex, Complex]:
+        """Return the transfer from swept angle and from mean voltage to the observed speed."""
+        eye = np.eye(self.by_angle.size)
+        inputs = np.stack([self.by_angle, self.by_voltage], axis=1)
+        solved = np.linalg.solve(z[:, None, None] * eye - self.advance, inputs[None])
+        found = np.asarray(solved, dtype=np.complex128)
+        return found[:, SPEED, 0], found[:, SPEED, 1]
+
+
+NO_OBSERVER = ObserverModel(np.zeros((0, 0)), np.zeros(0), np.zeros(0), np.zeros(0))
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,7 +170,15 @@ def sample(motors: Motors, loop: Loop, *, believed: Motors | None = None) -> Pla
     total = loop.loop_delay + motors.delay
     whole = np.floor(total / T + 1e-9).astype(int)
     late = np.clip(total - whole * T, 0.0, T)
-    _check_length(float(total.max()), float(window.max()), loop)
+    delay, averaged = float(total.max()), float(window.max())
+    samples = int(delay / T) + round(averaged / T)
+    if samples > MAX_LOOP_SAMPLES:
+        raise DesignError(
+            f"a delay of {1e3 * delay:.4g} ms and a window of {1e3 * averaged:.4g} ms at "
+            f"{loop.rate:.4g} Hz are {samples} samples, more than the limit of {MAX_LOOP_SAMPLES}. "
+            f"Sample at {MAX_LOOP_SAMPLES / max(delay + averaged, T):.3g} Hz or less, or average "
+            "over fewer samples"
+        )
     phi, gamma, phi_angle, zeta = _hold(motors, np.full(n, T))
     _, newest, _, newest_angle = _hold(motors, T - late)
     # A window within one step sees the end of it only.
@@ -180,20 +227,8 @@ def _average(window: Array, tail: Array, T: float) -> Array:
     return np.asarray(weights)
 
 
-def _check_length(delay: float, window: float, loop: Loop) -> None:
-    samples = int(delay / loop.sample_time) + round(window / loop.sample_time)
-    if samples <= MAX_LOOP_SAMPLES:
-        return
-    raise DesignError(
-        f"a delay of {1e3 * delay:.4g} ms and a window of {1e3 * window:.4g} ms at "
-        f"{loop.rate:.4g} Hz are {samples} samples, more than the limit of {MAX_LOOP_SAMPLES}. "
-        f"Sample at {MAX_LOOP_SAMPLES / max(delay + window, loop.sample_time):.3g} Hz or less, or "
-        "average over fewer samples"
-    )
-
-
 def _observer(believed: Motors, loop: Loop) -> ObserverModel:
-    """Return the observer that runs with the first of some motors as its model."""
+    """Return the steady-state observer that runs with the first of some motors as its model."""
     a0, a1, a2 = (float(a[0]) for a in (believed.a0, believed.a1, believed.a2))
     model = MotorModel(
         dc_gain=1 / a0,
@@ -201,9 +236,25 @@ def _observer(believed: Motors, loop: Loop) -> ObserverModel:
         time_constant_product=a2 / a0,
         delay=float(believed.delay[0]),
     )
-    return observer_model(
-        model, loop.sample_time, loop.count_angle, ObserverNoise(), loop.loop_delay
-    )
+    sample_time = loop.sample_time
+    *gain, variance = steady_gain(model, loop.count_angle, ObserverNoise(), sample_time)
+    correct = np.array(gain)
+    (F,), (G,) = prediction(model, np.array([sample_time]))
+    size = correct.size
+    # Coefficients of the innovation.
+    innovation = np.concatenate([[1.0], -F[0, 1:]])
+    advance = np.zeros((size, size))
+    advance[0] = (1 - correct[0]) * innovation
+    advance[1:, 1:] = F[1:, 1:]
+    advance[1:] += correct[1:, None] * innovation
+    by_angle = np.concatenate([[1 - correct[0]], correct[1:]])
+    by_voltage = np.concatenate([[0.0], G[1:]]) - G[0] * by_angle
+    total = loop.loop_delay + model.delay
+    whole = math.floor(total / sample_time + 1e-9)
+    late = min(max(total / sample_time - whole, 0.0), 1.0)
+    taps = np.zeros(whole + 2)
+    taps[whole], taps[whole + 1] = 1 - late, late
+    return ObserverModel(advance, by_angle, by_voltage, taps if late else taps[:-1], variance)
 
 
 def _hold(motors: Motors, t: Array) -> tuple[Array, Array, Array, Array]:

@@ -125,12 +125,6 @@ def planned_change(plant: Plant, plan: Reference, distance: float, time: Array) 
     return Change(low, around[1], high, forward, friction)
 
 
-def top_speed(plant: Plant, supply: float) -> float:
-    """Return the speed that a motor reaches at the headroom of the supply."""
-    m = plant.motors
-    return float((STEADY_VOLTAGE_SHARE * supply - m.static_voltage[0]) / m.a0[0])
-
-
 def plan_reference(
     plants: Sequence[Plant],
     loop: Loop,
@@ -189,10 +183,11 @@ def plan_reference(
 
 
 def _reachable(plant: Plant, loop: Loop, wished: float | None) -> float:
-    top, ratio = top_speed(plant, loop.supply_voltage), loop.gear_ratio
+    m, ratio = plant.motors, loop.gear_ratio
+    top = float((STEADY_VOLTAGE_SHARE * loop.supply_voltage - m.static_voltage[0]) / m.a0[0])
     if top <= 0:
         raise DesignError(
-            f"dry friction takes {plant.motors.static_voltage[0]:.3g} V of the "
+            f"dry friction takes {m.static_voltage[0]:.3g} V of the "
             f"{loop.supply_voltage:g} V supply: the motor cannot turn; raise the supply"
         )
     if wished is not None and wished > top:

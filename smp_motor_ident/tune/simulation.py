@@ -18,8 +18,7 @@ from smp_motor_ident._compile import compiled
 from smp_motor_ident.chain.terminal import Driver, no_driver, put_out
 from smp_motor_ident.tune.feedback import Feedback
 from smp_motor_ident.tune.limits import SETTLING_BAND
-from smp_motor_ident.tune.observer_model import NO_OBSERVER, SPEED
-from smp_motor_ident.tune.plant import Plant
+from smp_motor_ident.tune.plant import NO_OBSERVER, SPEED, Plant
 
 NO_EFFECT = no_driver()
 
@@ -96,8 +95,9 @@ def simulate(
     noise = still if inputs.noise is None else inputs.noise
     of_angle = still if inputs.angle_noise is None else inputs.angle_noise
     found = _run(
-        plant.phi, plant.taps, plant.phi_angle, plant.taps_angle, plant.sample_time, plant.sensor,
-        plant.average, observer.advance, observer.by_angle, observer.by_voltage, observer.taps,
+        (plant.phi, plant.taps, plant.phi_angle, plant.taps_angle), plant.sample_time, plant.sensor,
+        plant.average,
+        (observer.advance, observer.by_angle, observer.by_voltage, observer.taps),
         observer.variance,
         np.array(numbers, dtype=np.float64),
         np.asarray(inputs.low, dtype=np.float64),
@@ -162,17 +162,11 @@ def _observed(
 
 @compiled
 def _run(
-    phi: Array,
-    taps: Array,
-    phi_angle: Array,
-    taps_angle: Array,
+    plant: tuple[Array, Array, Array, Array],
     T: float,
     sensor: int,
     average: Array,
-    advance: Array,
-    by_angle: Array,
-    by_voltage: Array,
-    observer_taps: Array,
+    filtered: tuple[Array, Array, Array, Array],
     variance: float,
     controller: Array,
     low: Array,
@@ -190,6 +184,8 @@ def _run(
     lane: Array,
     back_emf: Array,
 ) -> tuple[Array, Array, NDArray[np.bool_]]:
+    phi, taps, phi_angle, taps_angle = plant
+    advance, by_angle, by_voltage, observer_taps = filtered
     n, m, s = taps.shape
     steps, window = low.size, average.shape[1]
     speed, voltage = np.empty((n, steps)), np.empty((n, steps))

@@ -58,9 +58,8 @@ class Trial:
         """In words."""
         if self.loop.speed_source == "difference":
             return f"counts differenced over {self.loop.difference_window} samples"
-        return {"measured": "the reported speed", "observer": "the observer"}[
-            self.loop.speed_source
-        ]
+        observed = self.loop.speed_source == "observer"
+        return "the observer" if observed else "the reported speed"
 
 
 def choose_source(estimate: Estimate, loop: Loop, **targets: Any) -> tuple[Loop, str]:
@@ -74,7 +73,10 @@ def choose_source(estimate: Estimate, loop: Loop, **targets: Any) -> tuple[Loop,
         loop, speed_source="difference", difference_window=max(loop.difference_window, 1)
     )
     longer = _longer(estimate, counted, usual, targets)
-    lacks = _object_to_observer(estimate)
+    # Dynamics that the residuals show may leave the estimates unchanged and still ring between
+    # motor and encoder.
+    shown = (f.message for f in estimate.findings if "explained_deviance" in f.evidence)
+    lacks = next((f"; not the observer, which depends on the model: {why}" for why in shown), "")
     watched = None if lacks else _trial(estimate, replace(loop, speed_source="observer"), targets)
     best, unsettled = _best(usual, longer, watched)
     if best is None:
@@ -139,15 +141,6 @@ def _remark_on_averaging(
         f"{taken}, which allows i = {now:.3g} V/rad; report it differenced over {window}, and give "
         f"--difference-window {window}, for i = {longer.integral:.3g} V/rad"
     )
-
-
-def _object_to_observer(estimate: Estimate) -> str:
-    """Return the reason against the observer: unmodelled dynamics in the residuals.
-
-    They may leave the estimates unchanged and still ring between motor and encoder.
-    """
-    shown = (f for f in estimate.findings if "explained_deviance" in f.evidence)
-    return next((f"; not the observer, which depends on the model: {f.message}" for f in shown), "")
 
 
 def _trial(estimate: Estimate, loop: Loop, targets: dict[str, Any]) -> Trial | None:

@@ -19,7 +19,6 @@ from smp_motor_ident.tune.margins import BatchMargins, Margins
 from smp_motor_ident.tune.plant import Plant, sample
 from smp_motor_ident.tune.problem import Problem
 from smp_motor_ident.tune.reference import STEP_SHARE, Change, Reference, planned_change
-from smp_motor_ident.tune.resonance import added_by_resonance
 from smp_motor_ident.tune.simulation import (
     Controller,
     Inputs,
@@ -29,6 +28,7 @@ from smp_motor_ident.tune.simulation import (
     simulate,
     step_figures,
 )
+from smp_motor_ident.tune.unmodelled import added_by_resonance
 
 
 @dataclass(frozen=True)
@@ -114,10 +114,7 @@ def figures_of(
     case: Case, usual: Plant, controller: Controller, reference: Reference,
     kept: tuple[Margins, BatchMargins], control_noise: float,
 ) -> tuple[Performance, Specification]:  # fmt: skip
-    """Simulate a design: the nominal motor, ``usual`` as it is sampled, and those that may be.
-
-    What margins they keep is known.
-    """
+    """Simulate a design with the margins ``kept``: the nominal motor, and those that may be."""
     problem, (margins, found) = case.problem, kept
     loop = replace(problem.loop, delay=problem.loop.expected_delay)
     change = STEP_SHARE * reference.max_velocity
@@ -128,6 +125,7 @@ def figures_of(
     answer = run.speed[0] / change
     figures = _performance(problem, controller.feedback, time, planned, control_noise)
     each = _runs(case, controller, loop, plan, change, time)
+    gain = band(margins.gain, found.gain)
     more, longer = added_by_resonance(problem.unmodelled, usual, controller.feedback, answer)
     return figures, Specification(
         samples=len(each) if case.drawn else 0,
@@ -135,7 +133,8 @@ def figures_of(
         overshoot=band(figures.overshoot, [one.overshoot for one in each], 100 * more),
         settling=band(figures.settling, [one.settling for one in each], longer),
         phase_margin=band(margins.phase, found.phase),
-        gain_margin=_stated(band(margins.gain, found.gain)),
+        # No larger at its low end than a record can vouch for
+        gain_margin=replace(gain, low=min(gain.low, MAX_STATED_GAIN_MARGIN.value)),
         sensitivity=band(margins.sensitivity, found.sensitivity),
     )
 
@@ -151,15 +150,18 @@ def _runs(
     shape = (len(plant), time.size)
     counted = _counted(plant, case.problem.plant)
     forward = plan.forward + case.swallowed * plan.friction
-    late = _draw_timing_errors(case, loop, shape)
+    most = min(math.sqrt(3.0) * case.scatter / loop.sample_time, 1.0)
+    late = np.random.default_rng(3).uniform(-most, most, shape)  # of each step [samples]
     run = simulate(
         plant,
         controller,
         replace(
             plan.inputs,
             forward=forward,
-            load=_draw_loads(case, plant.motors.static_voltage, shape) + late * _change(forward),
-            noise=_reported_noise(case, loop, shape) + late * _change(plan.reference),
+            load=_draw_loads(case, plant.motors.static_voltage, shape)
+            + late * np.diff(forward, prepend=forward[0]),
+            noise=_reported_noise(case, loop, shape)
+            + late * np.diff(plan.reference, prepend=plan.reference[0]),
             angle_noise=draw_white_noise(loop.angle_noise, shape, of=counted),
         ),
         count_angle=np.where(counted, loop.count_angle, 0.0),
@@ -201,16 +203,6 @@ def _draw_loads(case: Case, friction: Array, shape: tuple[int, int]) -> Array:
     noise = draw_white_noise(case.torque_noise, shape, 1)
     held: Array = np.broadcast_to((either * np.minimum(case.load, friction))[:, None], shape)
     return held if noise is None else held + noise
-
-
-def _draw_timing_errors(case: Case, loop: Loop, shape: tuple[int, int]) -> Array:
-    """Return the timing error of each step in samples, uniformly distributed."""
-    most = min(math.sqrt(3.0) * case.scatter / loop.sample_time, 1.0)
-    return np.random.default_rng(3).uniform(-most, most, shape)
-
-
-def _change(planned: Array) -> Array:
-    return np.diff(planned, prepend=planned[:1])
 
 
 def _reported_noise(case: Case, loop: Loop, shape: tuple[int, int]) -> Array | float:
@@ -263,11 +255,6 @@ def band(value: float, over: Sequence[float] | Array, added: float = 0.0) -> Ban
     beyond = int((1 - REQUIRED_SHARE) * (rising.size - 1))
     low, high = np.fmin(rising[beyond], value), np.maximum(rising[-1 - beyond], value)
     return Band(value, float(low), float(high) + added)
-
-
-def _stated(gain: Band) -> Band:
-    """Return a gain margin's band, whose low end is no larger than a record can vouch for."""
-    return replace(gain, low=min(gain.low, MAX_STATED_GAIN_MARGIN.value))
 
 
 def _instants(problem: Problem, fb: Feedback, reference: Reference) -> Array:

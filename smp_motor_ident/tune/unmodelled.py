@@ -9,10 +9,23 @@ stable with ``G``, if
 ``T`` being the complementary sensitivity.  With an observer, which predicts with the model, only
 what goes through the motor counts in its numerator.
 
+One that the recording does not exclude is a mass on a spring,
+
+    D(s) = m s^2 / (s^2 + 2 z w s + w^2),
+
+m being -1 where the speed is the mass's, and the ratio of its inertia to the rotor's where it is
+the rotor's.  For every w, and the dampings z of shafts, m is the largest of either sign up to 1
+that keeps ``|D|`` below W.  A loop whose response with the motor G is y has the error
+
+    E = D S Y / (1 + D T),
+
+S being its sensitivity.
+
 References
 ----------
 .. [1] S. Skogestad, I. Postlethwaite, Multivariable Feedback Control, 2nd ed. (2005), sections 7.4
-   and 7.5.1.
+   to 7.6.
+.. [2] G. Ellis, Control System Design Guide, 4th ed. (2012), chapter 16: resonances.
 """
 
 import math
@@ -20,9 +33,27 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from smp_motor_control.arrays import Array
+from smp_motor_control.arrays import Array, Complex
+from smp_motor_ident.infer.response_limits import RESONANCE_DAMPING
 from smp_motor_ident.result import Estimate
-from smp_motor_ident.tune.limits import RESONANCE_ERROR, UNKNOWN_RESPONSE_ERROR
+from smp_motor_ident.tune.feedback import Feedback
+from smp_motor_ident.tune.limits import (
+    MAX_RESONANCE_DAMPING,
+    RESONANCE_ERROR,
+    SETTLING_BAND,
+    UNKNOWN_RESPONSE_ERROR,
+)
+from smp_motor_ident.tune.plant import Plant
+from smp_motor_ident.tune.simulation import settling_time
+
+FREQUENCY_COUNT = 40
+"""Number of resonance frequencies, from the lowest of the bound up to Nyquist."""
+
+DAMPINGS = np.geomspace(RESONANCE_DAMPING.value, MAX_RESONANCE_DAMPING.value, 4)
+"""Of resonances, evenly spread over those of shafts."""
+
+SHORTEST, LONGEST = 2**13, 2**16
+"""Samples over which a resonance is followed; feedback may reduce its damping."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,3 +104,70 @@ def describe_known_band(unmodelled: UnmodelledDynamics | None, before: str = "; 
     if unmodelled is None or not math.isfinite(unmodelled.known):
         return ""
     return f"{before}the recording shows the motor's response up to {unmodelled.known:.3g} rad/s"
+
+
+def added_by_resonance(
+    unmodelled: UnmodelledDynamics | None, plant: Plant, feedback: Feedback, answer: Array
+) -> tuple[float, float]:
+    """Return the most that a resonance adds to overshoot and settling of a change of set-point.
+
+    ``answer``, shape (k,), is the motor's without one, as a share of the change from rest.
+    Returned are a share of the change, and a time [s]: NaN where it does not settle.
+    """
+    if unmodelled is None:
+        return 0.0, 0.0
+    T = plant.sample_time
+    nyquist = math.pi / T
+    lowest = min(float(unmodelled.frequency[0]), 0.5 * nyquist)
+    at = np.geomspace(lowest, 0.98 * nyquist, FREQUENCY_COUNT, dtype=np.float64)
+    ringing = -math.log(SETTLING_BAND.value) / (RESONANCE_DAMPING.value * unmodelled.known * T)
+    n = 2 ** math.ceil(math.log2(min(max(answer.size + ringing, SHORTEST), LONGEST)))
+    usual = np.pad(answer, (0, n - answer.size), mode="edge")
+    time = T * np.arange(n, dtype=np.float64)
+    omega = np.asarray(2 * np.pi * np.fft.rfftfreq(n, T)[1:], dtype=np.float64)
+    complementary, moved = _loop(plant, feedback, omega, usual)
+    ends, highest = [settling_time(time, usual)], usual.max()
+    for damping in DAMPINGS:
+        error = (
+            compute_modes(omega, at, damping, T)
+            * find_largest_modes(unmodelled, at, damping, T)[:, None]
+        )
+        for D in (error, -error):
+            spectrum = np.pad(D * moved / (1 + D * complementary), ((0, 0), (1, 0)))
+            rows = usual + np.fft.irfft(spectrum, n)
+            highest = max(highest, rows.max())
+            ends += [settling_time(time, row) for row in rows]
+    return float(highest - usual.max()), float(np.max(ends) - ends[0])
+
+
+def compute_modes(omega: Array, at: Array, damping: float, sample_time: float) -> Complex:
+    """Return ``s^2 / (s^2 + 2 z w s + w^2)`` over frequencies, a row for each w [rad/s].
+
+    Sampled by Tustin's rule prewarped at w, so that it is causal.
+    """
+    ratio = np.tan(0.5 * omega * sample_time) / np.tan(0.5 * at * sample_time)[:, None]
+    response: Complex = 1 / (1 - 1 / ratio**2 - 2j * damping / ratio)
+    return response
+
+
+def find_largest_modes(
+    unmodelled: UnmodelledDynamics, at: Array, damping: float, sample_time: float
+) -> Array:
+    """Return the largest m, up to 1, for which modes stay within the bound."""
+    ends = unmodelled.frequency[0], np.pi / sample_time
+    omega = np.union1d(np.geomspace(*ends, 10 * FREQUENCY_COUNT), at)
+    size = np.abs(compute_modes(omega, at, damping, sample_time))
+    m: Array = np.minimum((unmodelled.weight(omega) / size).min(axis=1), 1.0)
+    return m
+
+
+def _loop(plant: Plant, feedback: Feedback, omega: Array, answer: Array) -> tuple[Complex, Complex]:
+    """Return T through the motor, and S Y: the response of the speed to an error."""
+    z = np.exp(1j * omega * plant.sample_time)
+    control = feedback.response(omega, plant.sample_time)
+    response, through = plant.response(omega)[0], plant.through_motor(omega)[0]
+    # An observer's prediction from the voltage closes no loop around the motor.
+    own = 1 + control * (response - through)
+    spectrum = np.fft.rfft(np.diff(answer, prepend=0.0))[1:] / (1 - 1 / z)
+    whole = 1 + control * response
+    return control * through / whole, own / whole * spectrum

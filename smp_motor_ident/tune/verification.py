@@ -226,10 +226,7 @@ def bands_of(
 
 
 def _limit(readings: Sequence[float]) -> float:
-    """Return the upper prediction limit for one more of such readings.
-
-    G. Hahn, W. Meeker, Statistical Intervals, Wiley 1991, section 4.8.
-    """
+    """Return the upper prediction limit of one more reading (Hahn, Meeker 1991, section 4.8)."""
     n = len(readings)
     if not math.isfinite(sum(readings)):
         return math.inf

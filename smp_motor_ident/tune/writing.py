@@ -9,7 +9,7 @@ from typing import Any
 
 from smp_motor_control.errors import ParameterError
 from smp_motor_control.motor.hardware import DriveSettings
-from smp_motor_control.motor.model import MotorModel
+from smp_motor_control.motor.parameters import MotorModel
 from smp_motor_control.parameter_file import format_parameters
 from smp_motor_control.wheel.controller import WheelSettings
 from smp_motor_control.wheel.differenced import differenced_gains
@@ -32,7 +32,7 @@ def parameters(design: Design) -> dict[str, Any]:
     gains = dataclasses.asdict(design.gains)
     gains.pop("error_deadband")
     reference = design.wheel_reference
-    limit = reference.max_acceleration
+    limit, start = reference.max_acceleration, design.breakaway
     return {
         **gains,
         "max_velocity": float(reference.max_velocity),
@@ -45,7 +45,8 @@ def parameters(design: Design) -> dict[str, Any]:
         "difference_window": _window(design),
         "model": {name: float(value) for name, value in design.motor.items()},
         **_plausible(reference.drive.top_speed, design.loop),
-        **_must_turn(design.breakaway),
+        # From where a wheel that stands is at fault, if the usual voltage is too low
+        **({"stall_voltage": start} if start > FaultLimits().stall_voltage else {}),
         **_patience(design),
     }
 
@@ -118,11 +119,6 @@ def _plausible(top_speed: float, loop: Loop) -> dict[str, float]:
             MIN_OUTLIER_DEVIATIONS.value * loop.reported_noise / loop.gear_ratio
         )
     return limits
-
-
-def _must_turn(breakaway: float) -> dict[str, float]:
-    """Return the voltage from which a wheel that stands is at fault, where the usual is too low."""
-    return {"stall_voltage": breakaway} if breakaway > FaultLimits().stall_voltage else {}
 
 
 def gains_yaml(designs: Mapping[str, Design], provenance: Iterable[str]) -> str:

@@ -12,8 +12,7 @@ import pytest
 
 from smp_motor_control.encoder import Encoder
 from smp_motor_control.errors import ParameterError
-from smp_motor_control.motor.model import MotorModel
-from smp_motor_control.motor.parameters import Gearbox
+from smp_motor_control.motor.parameters import Gearbox, MotorModel
 from smp_motor_control.observer import ObserverNoise
 from smp_motor_control.pid import STRATEGIES, PidGains, PidOutput
 from smp_motor_control.reference.profile import Drive, ProfileLimits

@@ -12,7 +12,7 @@ from smp_motor_control.encoder import Encoder
 from smp_motor_control.motor import Gearbox, MotorParameters
 from smp_motor_control.motor.file import MotorEntry
 from smp_motor_control.motor.hardware import DrivenMotor, DriveSettings
-from smp_motor_control.motor.model import MotorModel
+from smp_motor_control.motor.parameters import MotorModel
 from smp_motor_control.pid import PidGains
 from smp_motor_control.reference.profile import Drive
 from smp_motor_control.wheel.loop import LoopSettings, WheelLoop

@@ -13,7 +13,7 @@ from scipy.linalg import expm
 from smp_motor_control.encoder import DifferencedSpeed, Encoder
 from smp_motor_control.errors import ParameterError
 from smp_motor_control.motor import Motor, MotorParameters
-from smp_motor_control.motor.model import MotorModel
+from smp_motor_control.motor.parameters import MotorModel
 from smp_motor_control.observer import ObserverNoise, SpeedObserver, prediction, steady_gain
 
 # Motors 1 (oscillating poles) and 2 (real poles) of the paper, and one without L.

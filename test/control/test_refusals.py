@@ -16,7 +16,7 @@ from smp_motor_control.errors import ParameterError
 from smp_motor_control.keyboard import Speeds
 from smp_motor_control.motor import MotorParameters
 from smp_motor_control.motor.hardware import DriveSettings
-from smp_motor_control.motor.model import MotorModel
+from smp_motor_control.motor.parameters import MotorModel
 from smp_motor_control.observer import ObserverNoise
 from smp_motor_control.pid import PidGains
 from smp_motor_control.reference.profile import ProfileLimits

@@ -18,7 +18,7 @@ from wheel_simulation import (
 from smp_motor_control import WHEELS
 from smp_motor_control.excitation import Fourier
 from smp_motor_control.motor.file import load_motors
-from smp_motor_control.motor.model import MotorModel
+from smp_motor_control.motor.parameters import MotorModel
 from smp_motor_control.pid import PidGains
 from smp_motor_control.wheel.loop import LoopSettings, WheelLoop
 

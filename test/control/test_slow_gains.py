@@ -6,8 +6,7 @@ from dataclasses import replace
 import pytest
 
 from smp_motor_control.errors import ParameterError
-from smp_motor_control.motor.model import MotorModel
-from smp_motor_control.motor.parameters import Gearbox
+from smp_motor_control.motor.parameters import Gearbox, MotorModel
 from smp_motor_control.pid import PidGains
 from smp_motor_control.wheel.acceptance import OperatingConditions, check
 from smp_motor_control.wheel.loop import LoopSettings

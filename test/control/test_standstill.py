@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 
 from smp_motor_control.encoder import Encoder
-from smp_motor_control.motor.model import MotorModel
-from smp_motor_control.motor.parameters import Gearbox
+from smp_motor_control.motor.parameters import Gearbox, MotorModel
 from smp_motor_control.observer import ObserverNoise
 from smp_motor_control.pid import PidGains
 from smp_motor_control.wheel import standstill

@@ -11,8 +11,7 @@ import pytest
 from wheel_world import DT, GAIN, GAINS, SETPOINT_TIMEOUT, SETTINGS, SUPPLY, TAU, World, silent
 
 from smp_motor_control.errors import ParameterError
-from smp_motor_control.motor.model import MotorModel
-from smp_motor_control.motor.parameters import Gearbox
+from smp_motor_control.motor.parameters import Gearbox, MotorModel
 from smp_motor_control.pid import PidGains
 from smp_motor_control.reference.profile import Drive, ProfileLimits
 from smp_motor_control.wheel.acceptance import OperatingConditions, check

@@ -9,8 +9,7 @@ from dataclasses import dataclass, replace
 import pytest
 
 from smp_motor_control.encoder import Encoder
-from smp_motor_control.motor.model import MotorModel
-from smp_motor_control.motor.parameters import Gearbox
+from smp_motor_control.motor.parameters import Gearbox, MotorModel
 from smp_motor_control.pid import PidGains
 from smp_motor_control.wheel.controller import State, WheelController, WheelSettings
 from smp_motor_control.wheel.faults import Fault, FaultLimits

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from wheel_simulation import Timing, simulate_closed_loop
 
-from smp_motor_control.motor.file import find_paper_motors, load_motors
+from smp_motor_control.motor.file import PAPER_MOTORS, find_config, load_motors
 from smp_motor_control.motor.hardware import DriveSettings
 from smp_motor_ident.bag.storage import Table
 from smp_motor_ident.cli import driving, tune
@@ -28,7 +28,7 @@ def table(time: np.ndarray, **columns: np.ndarray) -> Table:
 
 
 def test_a_drive_settles_as_tune_predicts(tmp_path):
-    motors = find_paper_motors()
+    motors = find_config(PAPER_MOTORS)
     gains = tmp_path / "gains.yaml"
     assert tune.main([str(motors), "--output", str(gains), "--supply", "12"]) == 0
     given = driving.read_designs(read_estimates(motors), gains)

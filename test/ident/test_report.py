@@ -18,8 +18,7 @@ from scipy.signal import lfilter
 
 from smp_motor_ident.finding import Finding
 from smp_motor_ident.report import tuning_page, words
-from smp_motor_ident.report.chart import thin
-from smp_motor_ident.report.drawing import ticks
+from smp_motor_ident.report.drawing import thin, ticks
 from smp_motor_ident.report.figures import Comparison, frequency_charts, residual_charts
 from smp_motor_ident.report.html import Report, render
 from smp_motor_ident.report.summary import find_doubted

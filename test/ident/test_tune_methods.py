@@ -17,7 +17,7 @@ from smp_motor_ident.tune.methods import METHODS
 from smp_motor_ident.tune.methods.margin import at_sensitivity
 from smp_motor_ident.tune.methods.pole_placement import place
 from smp_motor_ident.tune.methods.relay import oscillate, read_oscillation
-from smp_motor_ident.tune.methods.ziegler_nichols import from_ultimate
+from smp_motor_ident.tune.methods.rules import from_ultimate
 from smp_motor_ident.tune.motors import Motors
 from smp_motor_ident.tune.plant import sample
 from smp_motor_ident.tune.problem import FirstOrderDelay, Problem

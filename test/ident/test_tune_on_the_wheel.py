@@ -16,7 +16,7 @@ from smp_motor_control.fields import parameters_in
 from smp_motor_control.fields import settings_of as settings_of_parameters
 from smp_motor_control.motor.file import load_motors
 from smp_motor_control.motor.hardware import DrivenMotor, DriveSettings
-from smp_motor_control.motor.model import MotorModel
+from smp_motor_control.motor.parameters import MotorModel
 from smp_motor_control.parameter_file import flatten
 from smp_motor_control.reference.profile import ProfileLimits, Reference
 from smp_motor_control.reference.time_optimal import VoltageLimited

@@ -12,7 +12,7 @@ from wheel_simulation import Timing, simulate_closed_loop
 
 from smp_motor_control.motor.file import load_motors
 from smp_motor_control.motor.hardware import DriveSettings
-from smp_motor_control.motor.model import MotorModel
+from smp_motor_control.motor.parameters import MotorModel
 from smp_motor_control.wheel.loop import LoopSettings
 from smp_motor_ident.cli.tune import main
 from smp_motor_ident.cli.tuning import read_estimates

@@ -16,9 +16,12 @@ from smp_motor_ident.tune.feedback import Feedback
 from smp_motor_ident.tune.motors import motors_of
 from smp_motor_ident.tune.plant import sample
 from smp_motor_ident.tune.problem import Problem
-from smp_motor_ident.tune.resonance import added_by_resonance
 from smp_motor_ident.tune.specification import band
-from smp_motor_ident.tune.unmodelled import UnmodelledDynamics, unmodelled_dynamics
+from smp_motor_ident.tune.unmodelled import (
+    UnmodelledDynamics,
+    added_by_resonance,
+    unmodelled_dynamics,
+)
 from smp_motor_ident.tune.writing import gains_document
 
 LOOP = Loop(sample_time=0.005, delay=0.005, gear_ratio=1.0, counts_per_revolution=None)

@@ -21,7 +21,7 @@ from smp_interfaces.msg import MotorState
 from smp_motor_control import WHEELS
 from smp_motor_control.motor.file import load_motors
 from smp_motor_control.nodes.executor import LeanExecutor
-from smp_motor_ident.tune.methods.ziegler_nichols import RULES
+from smp_motor_ident.tune.methods.rules import RULES
 
 ROOT = Path(__file__).resolve().parents[2]
 MOTORS = ROOT / "config" / "motors_paper.yaml"

@@ -22,23 +22,18 @@ def _open(path: Path, name: str, budget: Budget) -> ColumnFile:
     """Read a file of any version."""
     head, answer = apart.read("MATLAB", path, name, budget)
     columns = {key: np.load(answer, allow_pickle=False) for key in head.get("columns", ())}
-    advice = f"{name}: {_advice(head['objects'])}"
+    objects = ", ".join(list(dict.fromkeys(head["objects"]))[:_MAX_NAMED_OBJECTS])
+    advice = (
+        f"{name}: holds MATLAB objects, such as a timeseries or a Simulink Dataset, which only "
+        f"MATLAB can read: {objects}; save its Time and Data as arrays there: "
+        "t = x.Time; y = x.Data; save('log.mat', 't', 'y'), where of a Dataset x = data{1}.Values"
+    )
     if head["objects"] and not columns:
         raise BagError(advice)
     file = ColumnFile(path, name, columns)
     if head["objects"]:
         file.problems.append(found("matlab_object", advice, "warning"))
     return file
-
-
-def _advice(objects: list[str]) -> str:
-    """Return advice on objects, which only MATLAB can open."""
-    some = ", ".join(list(dict.fromkeys(objects))[:_MAX_NAMED_OBJECTS])
-    return (
-        "holds MATLAB objects, such as a timeseries or a Simulink Dataset, which only MATLAB can "
-        f"read: {some}; save its Time and Data as arrays there: "
-        "t = x.Time; y = x.Data; save('log.mat', 't', 'y'), where of a Dataset x = data{1}.Values"
-    )
 
 
 FORMAT_4 = Format("MATLAB 4", (".mat",), b"\0\0\0\0", _open)

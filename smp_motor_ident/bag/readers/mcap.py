@@ -96,18 +96,16 @@ class _McapFile(Messages):
     ) -> list[Batch]:
         """Return the messages of a chunk, or the readable ones of a chunk that is cut off."""
         try:
-            head = records.read_chunk(body)
+            size, crc, compression, packed = records.read_chunk(body)
         except records.DAMAGE:
             self._cut(start, "inside a chunk's head")
             return []
-        packed = body[head.begin :][: head.stored]
-        data = decompress(packed, head.compression, self._budget)
-        sound = len(data) == head.size and (not head.crc or zlib.crc32(data) == head.crc)
+        data = decompress(packed, compression, self._budget)
+        sound = len(data) == size and (not crc or zlib.crc32(data) == crc)
         if whole and not sound:
-            self._amiss(
-                f"the chunk at byte {start} is damaged and was left out"
-                f"{self._count_of_chunk(start)}"
-            )
+            index = self._chunks.get(start)
+            many = f" with {index.messages} messages" if index and index.channels else ""
+            self._amiss(f"the chunk at byte {start} is damaged and was left out{many}")
             return []
         positions, end = self._walk(data)
         if not whole:
@@ -195,14 +193,8 @@ class _McapFile(Messages):
     def _skippable(self, start: int, wanted: Callable[[Channel], bool]) -> bool:
         """Return whether a chunk has no wanted message according to the index."""
         index = self._chunks.get(start)
-        if index is None or not index.channels:
-            return False
-        inside = [self._channels.get(key) for key in index.channels]
-        return all(channel is not None and not wanted(channel) for channel in inside)
-
-    def _count_of_chunk(self, start: int) -> str:
-        index = self._chunks.get(start)
-        return f" with {index.messages} messages" if index is not None and index.channels else ""
+        inside = [self._channels.get(key) for key in index.channels] if index else []
+        return bool(inside) and all(c is not None and not wanted(c) for c in inside)
 
     def _resume(self, file: BinaryIO, start: int) -> bool:
         """Continue at the next indexed chunk after a damaged place."""

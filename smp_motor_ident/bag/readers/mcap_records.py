@@ -35,16 +35,6 @@ class Channel(NamedTuple):
     metadata: dict[str, str]
 
 
-class Chunk(NamedTuple):
-    """The head of a chunk: where its messages begin and how they are compressed."""
-
-    size: int  # uncompressed [bytes]
-    crc: int  # of the uncompressed bytes; 0 if absent
-    compression: str
-    begin: int
-    stored: int  # compressed [bytes]
-
-
 class ChunkIndex(NamedTuple):
     """Where a chunk begins in the file, its channels and its number of messages."""
 
@@ -104,12 +94,12 @@ def read_channel(body: bytes) -> Channel:
     return Channel(key, schema, topic, encoding, metadata)
 
 
-def read_chunk(body: bytes) -> Chunk:
-    """Read the head of a chunk, whose messages may be cut off."""
+def read_chunk(body: bytes) -> tuple[int, int, str, bytes]:
+    """Read a chunk: its size and CRC (0 if absent) unpacked, its compression and packed bytes."""
     fields = _Fields(body)
     _, _, size, crc = fields.numbers("QQQI")
     compression, (stored,) = fields.text(), fields.numbers("Q")
-    return Chunk(size, crc, compression, fields.at, stored)
+    return size, crc, compression, body[fields.at :][:stored]
 
 
 def read_chunk_index(body: bytes) -> ChunkIndex:

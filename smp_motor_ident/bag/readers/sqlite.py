@@ -10,7 +10,6 @@ from urllib.parse import quote
 
 import numpy as np
 
-from smp_motor_control.arrays import Integers
 from smp_motor_ident.bag.readers.format import Format, Messages
 from smp_motor_ident.bag.salvage import salvage
 from smp_motor_ident.bag.storage import Batch, Channel, join, message_type
@@ -119,7 +118,11 @@ class _SqliteFile(Messages):
             if not self._cut_off:
                 where = "before its first message" if last == _BEFORE else f"behind message {last}"
                 self._amiss(f"damaged {where} ({error})")
-            yield from self._salvaged(asked, last)
+            for rows in salvage(self._path_read):  # of single pages, after the last of the tree
+                wanted_rows = [row for row in rows if row[0] > last and row[1] in asked]
+                self._budget.take(sum(len(row[3]) for row in wanted_rows))
+                if wanted_rows:
+                    yield self._split(wanted_rows, asked)
 
     def _reads(self, asked: dict[int, Channel]) -> Iterator[tuple[int, list[Batch]]]:
         """Yield the number of the last row, and a block of rows by topic."""
@@ -148,14 +151,6 @@ class _SqliteFile(Messages):
         self._budget.take(size + _ROW * len(rows))
         return rows
 
-    def _salvaged(self, asked: dict[int, Channel], last: int) -> Iterator[list[Batch]]:
-        """Yield rows of single pages after the last row of the tree."""
-        for rows in salvage(self._path_read):
-            wanted = [row for row in rows if row[0] > last and row[1] in asked]
-            self._budget.take(sum(len(row[3]) for row in wanted))
-            if wanted:
-                yield self._split(wanted, asked)
-
     def _split(
         self, rows: list[tuple[int, int, int, bytes]], asked: dict[int, Channel]
     ) -> list[Batch]:
@@ -168,13 +163,8 @@ class _SqliteFile(Messages):
             sound = [r for r in rows if isinstance(r[3], bytes) and isinstance(r[2], int)]
             self._amiss(f"{len(rows) - len(sound)} messages without data were left out")
             return self._split(sound, asked) if sound else []
-        return self._by_topic(np.array(keys, np.int64), joined, asked)
-
-    @staticmethod
-    def _by_topic(topic: Integers, batch: Batch, asked: dict[int, Channel]) -> list[Batch]:
-        """Return the messages of each topic."""
-        which = {key: np.flatnonzero(topic == key) for key in asked}
-        return [replace(batch.take(k), channel=asked[key]) for key, k in which.items() if k.size]
+        which = {key: np.flatnonzero(np.array(keys, np.int64) == key) for key in asked}
+        return [replace(joined.take(k), channel=asked[key]) for key, k in which.items() if k.size]
 
 
 FORMAT = Format("SQLite bag", (".db3",), MAGIC, _SqliteFile, tables=False)

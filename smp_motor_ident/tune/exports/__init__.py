@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Export gains to other loops: one file per target, in its own units and arithmetic."""
+"""Export gains to other loops, in their own units and arithmetic."""
 
 import math
 from collections.abc import Mapping
@@ -7,31 +7,11 @@ from typing import Any
 
 from smp_motor_control.errors import printable
 from smp_motor_ident.result import Estimate
-from smp_motor_ident.tune.exports import (
-    arduino_pid,
-    linorobot2,
-    roboclaw,
-    ros2_controllers,
-    ros_arduino_bridge,
-    wpilib,
-)
+from smp_motor_ident.tune.exports.formats import FORMATS
 from smp_motor_ident.tune.exports.target import Check, Format, Gains, check
 from smp_motor_ident.tune.limits import SETTLING_BAND
 from smp_motor_ident.tune.loop import Loop
 from smp_motor_ident.tune.wheels import Sets, design_wheels
-
-FORMATS: Mapping[str, Format] = {
-    module.FORMAT.name: module.FORMAT
-    for module in (
-        ros2_controllers,
-        linorobot2,
-        ros_arduino_bridge,
-        arduino_pid,
-        roboclaw,
-        wpilib,
-    )
-}
-"""Every target by its name."""
 
 
 def export(

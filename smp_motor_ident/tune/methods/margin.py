@@ -21,7 +21,7 @@ from smp_motor_ident.errors import DesignError
 from smp_motor_ident.tune.feedback import Feedback, spectral_radius, terms
 from smp_motor_ident.tune.limits import MAX_SPEED_NOISE
 from smp_motor_ident.tune.margins import loop_margins
-from smp_motor_ident.tune.methods.simc import SIMC
+from smp_motor_ident.tune.methods.rules import SIMC
 from smp_motor_ident.tune.problem import Method, Problem, RequiredMargins
 from smp_motor_ident.tune.unmodelled import describe_known_band
 

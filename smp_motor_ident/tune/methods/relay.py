@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from smp_motor_control.arrays import Array
 from smp_motor_ident.errors import DesignError
 from smp_motor_ident.tune.feedback import Feedback
-from smp_motor_ident.tune.methods.ziegler_nichols import from_ultimate
+from smp_motor_ident.tune.methods.rules import from_ultimate
 from smp_motor_ident.tune.problem import Method, Problem, RequiredMargins
 
 MIN_CYCLES = 4
@@ -66,10 +66,7 @@ def oscillate(
 def read_oscillation(
     stretches: Sequence[tuple[Array, Array]], sample_time: float
 ) -> tuple[float, float]:
-    """Return ultimate gain and period of the voltages and speeds of a relay oscillation.
-
-    A record may be in several stretches, where its computer stood still between them.
-    """
+    """Return ultimate gain and period of a relay oscillation, by stretches of voltage and speed."""
     switches = [_settled(voltage) for voltage, _ in stretches]
     lengths = np.concatenate([[], *map(np.diff, switches)])
     if lengths.size < MIN_CYCLES:

@@ -117,10 +117,7 @@ def _cells(row: Iterable[Any]) -> list[Any]:
 
 
 def _contents(data: bytes, objects: list[str], memory: int) -> Iterator[dict[str, Any]]:
-    """Yield the variables of a file by their names, as its version's library gives them.
-
-    Note the objects of version 7.3.
-    """
+    """Yield the variables of a file by their names; note the objects of version 7.3."""
     if data.startswith(b"MATLAB 7.3 MAT"):
         try:
             import h5py

@@ -1,13 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Ziegler-Nichols and Tyreus-Luyben: rules from the ultimate gain and period.
+"""Published rules: SIMC, and those from the ultimate gain and period.
 
-The ultimate point is that of the model in the sampled loop, with its hold and delay.
+SIMC makes the closed loop of first order, as fast as the delay allows, or slower on request.  The
+ultimate point is that of the model in the sampled loop, with its hold and delay.
 
 References
 ----------
-.. [1] J. G. Ziegler, N. B. Nichols, Optimum settings for automatic controllers,
+.. [1] S. Skogestad, Simple analytic rules for model reduction and PID controller tuning,
+   J. Process Control 13 (2003), 291-309: half rule and equations (23) to (25).
+.. [2] J. G. Ziegler, N. B. Nichols, Optimum settings for automatic controllers,
    Trans. ASME 64 (1942), 759-768.
-.. [2] B. D. Tyreus, W. L. Luyben, Tuning PI controllers for integrator/dead time processes,
+.. [3] B. D. Tyreus, W. L. Luyben, Tuning PI controllers for integrator/dead time processes,
    Ind. Eng. Chem. Res. 31 (1992), 2625-2628; PID values: W. L. Luyben, M. L. Luyben,
    Essentials of Process Control (1997), p. 97.
 """
@@ -26,6 +29,13 @@ RULES = {
 }
 
 
+def _solve_simc(problem: Problem) -> Feedback:
+    model = problem.reduced
+    wished = problem.target("closed_loop_time_constant", model.delay)
+    p = model.time_constant / (model.gain * (wished + model.delay))
+    return Feedback(p, p / min(model.time_constant, 4 * (wished + model.delay)))
+
+
 def from_ultimate(problem: Problem, rule: str, gain: float, period: float) -> Feedback:
     """Apply a rule to an ultimate point from a model or a relay."""
     ruled = by_rule(rule, problem.structure or "pi", gain, period)
@@ -41,6 +51,14 @@ def by_rule(rule: str, structure: str, gain: float, period: float) -> Feedback:
     return Feedback(p, p / (integral * period), p * td, td / 10)
 
 
+SIMC = Method(
+    "simc",
+    "SIMC, closed loop as fast as the delay",
+    "Skogestad 2003",
+    RequiredMargins(phase=45.0, gain=2.0, sensitivity=1.7),
+    _solve_simc,
+    ("closed_loop_time_constant",),
+)
 ZIEGLER_NICHOLS = Method(
     "ziegler_nichols",
     "Ziegler-Nichols from the ultimate point",
