@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 
 ROOT = Path(__file__).resolve().parents[1]
-sys.path[:0] = [str(ROOT), str(ROOT / "test" / "ident")]
+sys.path[:0] = [str(ROOT), str(ROOT / "test"), str(ROOT / "test" / "ident")]
 
 import exports  # noqa: E402
 import test_known_loop as loops  # noqa: E402

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 ROOT = Path(__file__).resolve().parents[1]
-sys.path[:0] = [str(ROOT), str(ROOT / "test" / "ident")]
+sys.path[:0] = [str(ROOT), str(ROOT / "test"), str(ROOT / "test" / "ident")]
 
 import independent  # noqa: E402
 
