@@ -409,7 +409,7 @@ def test_our_names_in_the_table_of_ros2_controllers_are_parameters():
     text = (ROOT / "docs/ros2-controllers.md").read_text()
     topics = set(re.findall(r"`([\w/<>~]+)`", (ROOT / "docs/nodes.md").read_text())) | {"/tf"}
     names = known("skid_steer"), known("wheel_pid"), topics
-    for there, part in zip(names, text.split("\n ")[1:], strict=True):
+    for there, part in zip(names, text.split("\n## ")[1:], strict=True):
         rows = [line.split("|") for line in part.splitlines() if line.startswith("| ")][1:]
         ours = {name for row in rows for name in re.findall(r"`([\w./<>~]+)`", row[2])}
         assert ours <= there
