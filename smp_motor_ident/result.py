@@ -72,14 +72,11 @@ class Share:
         Its standard deviation relative to the number; None where the number is zero.
     size : float
         Its standard deviation in the number's unit.
-    side : {-1, 0, 1}
-        The only direction in which the number may move; 0 where it may move either way.
     """
 
     cause: str
     share: NotNegative | None
     size: NotNegative
-    side: Literal[-1, 0, 1] = 0
 
 
 @dataclass(frozen=True)
@@ -125,12 +122,8 @@ class Quantity:
         """95 % interval of random and systematic uncertainty together, in ``unit``."""
         if self.ci95 is None or self.value is None:
             return self.ci95
-        low, high = (
-            math.hypot(
-                end - self.value, *(NORMAL_95 * s.size for s in self.systematic if s.side != -side)
-            )
-            for end, side in zip(self.ci95, (-1, 1))
-        )
+        sizes = [NORMAL_95 * s.size for s in self.systematic]
+        low, high = (math.hypot(end - self.value, *sizes) for end in self.ci95)
         return self.value - low, self.value + high
 
 
@@ -206,14 +199,11 @@ class Systematic:
         Its standard deviation, relative.
     moves : mapping of str to float
         Change of each number by one standard deviation of it, in the number's own unit.
-    one_sided : bool
-        Whether it moves the numbers in this direction only.
     """
 
     cause: str
     share: float
     moves: Mapping[str, float]
-    one_sided: bool = False
 
 
 @dataclass(frozen=True)

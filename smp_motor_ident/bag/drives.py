@@ -4,7 +4,7 @@
 from itertools import product
 
 import numpy as np
-from scipy.signal import correlate
+from scipy.fft import irfft, next_fast_len, rfft
 from scipy.special import fdtrc, ndtri
 
 from smp_motor_control.arrays import Array, Integers
@@ -124,11 +124,12 @@ def find_late_rows(u: Array, y: Array) -> int:
 def _explained_shares_by_shift(x: Array, y: Array, shifts: Integers) -> Array:
     """Return the share of ``y[k]`` explained by a multiple of ``x[k + shift]`` at each shift."""
     x = x - x.mean()
-    both = correlate(x, y, "full")[y.size - 1 + shifts]
+    size = next_fast_len(x.size + y.size, real=True)
+    both = irfft(rfft(x, size) * np.conj(rfft(y, size)), size)[shifts]
     own, moved = (np.concatenate([[0.0], np.cumsum(v**2)]) for v in (x, y))
     begin, end = np.maximum(shifts, 0), y.size + np.minimum(shifts, 0)
-    size = (own[end] - own[begin]) * (moved[end - shifts] - moved[begin - shifts])
-    return np.asarray(both**2 / np.where(size > 0, size, np.inf))
+    energy = (own[end] - own[begin]) * (moved[end - shifts] - moved[begin - shifts])
+    return np.asarray(both**2 / np.where(energy > 0, energy, np.inf))
 
 
 def _residual_share(u: Array, y: Array, shift: int, lag: float) -> float:

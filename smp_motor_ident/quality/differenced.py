@@ -20,7 +20,6 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from scipy.signal import savgol_coeffs, savgol_filter
 
 from smp_motor_control.arrays import Array
 from smp_motor_ident.finding import Finding
@@ -88,6 +87,8 @@ def _smooth_but_for_one(moved: Array) -> bool:
     if moved.size < LOCAL or np.abs(moved).max() > COUNTS_A_SAMPLE.value:
         return False
     count = np.cumsum(moved)
+    from scipy.signal import savgol_coeffs, savgol_filter  # takes a while to load
+
     rest = count - savgol_filter(count, LOCAL, 3)
     turns = np.convolve(moved != 0, np.ones(LOCAL), "same") > 1
     left = 1 - float(savgol_coeffs(LOCAL, 3)[LOCAL // 2])  # of a white error

@@ -59,7 +59,6 @@ UNEXPLAINED = Limit(
     "times its deviation is beyond any counter",
     "test_findings.py",
 )  # fmt: skip
-STEADY = Limit(4.0, "time constants", "98 % of a step are over", "test_estimate.py")
 FEWEST = Limit(
     40, "samples", "ten for each of gain, lag, friction and initial state", "test_data_quality.py"
 )

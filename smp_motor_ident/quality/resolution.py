@@ -12,8 +12,6 @@ from smp_motor_ident.record import Record
 
 REST = 10
 """Samples after which an unchanged count counts as standstill."""
-JITTER = 2_000
-"""Samples that tell whether the stamps jitter."""
 FINEST_ENCODER = 2 * np.pi / 2**17
 """Resolution [rad] of the encoders of servos, finer than those of any wheel."""
 FINEST_SENSOR = 1e-4

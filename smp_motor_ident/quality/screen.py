@@ -22,8 +22,6 @@ from smp_motor_ident.quality.units import (
 from smp_motor_ident.record import Record
 
 RUNS = 2_000  # runs of samples in which signals are averaged before they are compared
-INSTRUMENTS = 8  # lags of the voltage whose sum models the motor's response
-RUN_CORRELATION = 20.0  # largest variance inflation by correlated errors of neighbouring runs
 
 
 def screen(records: Sequence[Record]) -> list[Finding]:
@@ -294,15 +292,3 @@ def _period(records: Sequence[Record]) -> float:
     """Return the period of the voltage's sign changes [samples]."""
     changes = sum(np.count_nonzero(np.diff(np.sign(r.voltage))) for r in records)
     return 2 * sum(len(r) for r in records) / max(changes, 1)
-
-
-def of_the_winding(record: Record, current: Array) -> tuple[Array, Array, Array]:
-    """Return voltage, speed and current as means over runs in which a counter's noise is small."""
-    k = max(1, len(record) // RUNS)
-    n = len(record) // k * k
-    v, w, i = (x[:n].reshape(-1, k) for x in (record.voltage, measured_speed(record), current))
-    known = np.isfinite(i) & np.isfinite(w)
-    keep = known.any(axis=1)
-    samples = np.maximum(known.sum(axis=1), 1)
-    w, i = (np.where(known, x, 0.0).sum(axis=1) / samples for x in (w, i))
-    return v.mean(axis=1)[keep], w[keep], i[keep]

@@ -8,7 +8,6 @@ beat is the lower envelope of the arrivals, whatever the distribution of the lat
 repeated stamps, which round a regular time down, lie above such a line, too.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Any
@@ -229,13 +228,6 @@ def on_beat(record: Record) -> Record:
         time=(beat.time - beat.time[0]) * 1e-9,
         findings=(*record.findings, finding),
     )
-
-
-def clock_share(records: Sequence[Record]) -> float:
-    """Return the uncertainty of the sender's clock behind arrivals, relative to its interval."""
-    beats = [f.evidence for r in records for f in r.findings if f.code == "arrival_beat"]
-    shares = [float(b["deviation"] or 0.0) / float(b["period"] or 1.0) for b in beats]
-    return max(shares, default=0.0)
 
 
 def merge_bunches(record: Record) -> Record:

@@ -168,17 +168,11 @@ def _with_unit(text: str, unit: str) -> str:
 def systematic(quantity: Quantity) -> str:
     """Return the systematic uncertainties of a number, each with its cause."""
     shown = scaled(quantity)
-    signs = {-1: "−", 0: "± ", 1: "+"}
-    words = [
-        signs[one.side]
-        + (
-            f"{100 * one.share:.2g} %"
-            if one.share is not None
-            else _with_unit(spread(one.size), shown.unit)
-        )
-        + f" ({cause(one.cause)})"
-        for one in shown.systematic
-    ]
+    words = []
+    for one in shown.systematic:
+        unit = _with_unit(spread(one.size), shown.unit)
+        size = f"{100 * one.share:.2g} %" if one.share is not None else unit
+        words.append(f"± {size} ({cause(one.cause)})")
     volts = (quantity.valid or {}).get("voltage")
     return ", ".join([*words, *([f"seen at ±{volts[1]:.3g} V only"] if volts else [])])
 

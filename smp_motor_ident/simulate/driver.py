@@ -11,7 +11,6 @@ from smp_motor_ident.simulate.lanes import (
     CURRENT_LIMIT,
     DECAY,
     DECLINE,
-    DIODES,
     DROP,
     FREE,
     SAG,
@@ -19,7 +18,7 @@ from smp_motor_ident.simulate.lanes import (
 
 
 @inlined
-def _fast_decay(te: float, command: float, emf: float, supply: float, diodes: float) -> float:
+def _fast_decay(te: float, command: float, emf: float, supply: float) -> float:
     """Return the mean voltage of a bridge that is off for the rest of each PWM period [V].
 
     The current that rose meanwhile falls against the supply through the diodes until it is zero or
@@ -28,7 +27,7 @@ def _fast_decay(te: float, command: float, emf: float, supply: float, diodes: fl
     """
     duty = min(abs(command) / supply, 1.0)
     along = emf if command > 0.0 else -emf
-    drive, brake = supply - along, supply + diodes + along
+    drive, brake = supply - along, supply + along
     if drive <= 0.0 or brake <= 0.0:
         return command
     rise = drive * (1.0 - math.exp(-duty / te))
@@ -47,7 +46,7 @@ def terminal_voltage(
         out += lane[FREE] * emf
         return out
     if lane[DECAY] > 0.0:
-        out = _fast_decay(lane[DECAY], out, emf, full_duty, lane[DIODES])
+        out = _fast_decay(lane[DECAY], out, emf, full_duty)
     drive: float = out - emf
     if lane[SAG] != 0.0:
         duty = command / full_duty

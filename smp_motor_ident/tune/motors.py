@@ -16,8 +16,6 @@ from smp_motor_ident.tune.limits import MAX_FRICTION_ERROR, MAX_FRICTION_RANGE, 
 SENSOR = ("delay", "averaging_window", "sensor_lag")
 """Delays between the motor's speed and the reported one, in s each."""
 
-_ABSENT = (*SENSOR, "time_constant_product")
-"""Quantities that are zero where an estimate does not state them."""
 
 _POSITIVE = ("dc_gain", "time_constant", "resistance", "inductance", "motor_constant", "inertia")
 

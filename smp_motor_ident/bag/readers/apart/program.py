@@ -21,7 +21,6 @@ import numpy as np
 _HEAD = 128  # bytes of a file of version 5 before its first variable
 _DEEPEST = 16
 _WIDEST = 64  # columns of a matrix that are taken as signals; a wider one is something else
-_MOST_VALUES = 100_000  # of structures and cells that are looked at
 _MOST_ROWS = 1_048_576  # of a sheet, by Excel's own limits
 _UNBOUND = resource.getrlimit(resource.RLIMIT_AS)[1]
 _SLACK = 1 << 26  # memory that readers need in addition to the file's contents [byte]
