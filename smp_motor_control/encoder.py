@@ -83,8 +83,7 @@ class Unwrapper:
         return self._total
 
 
-COUNTER_WIDTHS = (8, 16, 24, 32)
-"""Common widths of hardware counters [bits]."""
+COUNTER_WIDTHS = (8, 16, 24, 32)  # common widths of hardware counters [bits]
 
 
 class CounterWidth:

@@ -22,8 +22,7 @@ _ROS_MODULES = ("ament_index_python", "builtin_interfaces", "rcl_interfaces", "r
 _TOOL_MODULES = ("numpy", "scipy", "numba", "yaml", "rosbags", "msgspec", "rich")
 """Modules that a tool needs, checked before it starts because some are imported late."""
 
-MAX_DOMAIN_ID = 232
-"""Highest domain whose ports stay below 65536 (DDSI-RTPS 2.5, section 9.6.1.1)."""
+MAX_DOMAIN_ID = 232  # highest domain whose ports stay below 65536 (DDSI-RTPS 2.5, section 9.6.1.1)
 
 
 def _make_program(module: str, interrupt_code: int) -> Callable[[], int]:

@@ -16,8 +16,7 @@ import numpy as np
 from smp_motor_control.arrays import Array
 from smp_motor_control.errors import ParameterError, check_positive
 
-DETUNING = math.sqrt(1.05)
-"""Irrational ratio of the actual to the nominal frequency."""
+DETUNING = math.sqrt(1.05)  # irrational ratio of the actual to the nominal frequency
 
 _MAX_CREST_FACTOR = 2.2
 _GOLDEN_RATIO = (math.sqrt(5.0) - 1.0) / 2.0

@@ -10,14 +10,12 @@ import yaml
 
 from smp_motor_control.errors import ParameterError, printable
 
-MAX_BYTES = 1_000_000
-"""Maximum size of a file; parsing takes some 10 s per megabyte."""
+MAX_BYTES = 1_000_000  # maximum size of a file; parsing takes some 10 s per megabyte
 
 MAX_NODES = 100_000
 """Maximum number of values, with aliases expanded: ten lines can expand to 10^9 values."""
 
-MAX_DEPTH = 32
-"""Maximum depth of nesting."""
+MAX_DEPTH = 32  # maximum depth of nesting
 
 
 class _Loader(yaml.SafeLoader):

@@ -23,14 +23,11 @@ from typing import NamedTuple
 from smp_motor_control.errors import ParameterError, check_range
 from smp_motor_control.fields import described, parameters_in
 
-EPSILON = 2.220446049250313e-16
-"""Errors, gains and time steps up to this size count as zero."""
+EPSILON = 2.220446049250313e-16  # errors, gains and time steps up to this size count as zero
 
-MAX_GAIN = 1e9
-"""Maximum of any gain, weight, clamp or time constant; products of three stay finite."""
+MAX_GAIN = 1e9  # maximum of any gain, weight, clamp or time constant; products of three stay finite
 
-STRATEGIES = ("none", "back_calculation", "conditional_integration")
-"""Anti-windup strategies."""
+STRATEGIES = ("none", "back_calculation", "conditional_integration")  # anti-windup strategies
 
 _CLAMP = "limit of the output [V], in addition to the supply."
 

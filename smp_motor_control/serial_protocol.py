@@ -24,15 +24,12 @@ from typing import NamedTuple
 
 from smp_motor_control.errors import ParameterError
 
-MAX_LINE_LENGTH = 512
-"""Longer lines are discarded as noise."""
+MAX_LINE_LENGTH = 512  # longer lines are discarded as noise
 
-CLOCK_PERIOD_US = 1 << 32
-"""Range of the board's clock [us]."""
+CLOCK_PERIOD_US = 1 << 32  # range of the board's clock [us]
 
 
-_INTEGER = re.compile(r"-?[0-9]{1,18}")
-"""Whole numbers that fit in 64 bits."""
+_INTEGER = re.compile(r"-?[0-9]{1,18}")  # whole numbers that fit in 64 bits
 
 
 class BoardState(NamedTuple):

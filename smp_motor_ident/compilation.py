@@ -21,8 +21,7 @@ from smp_motor_ident.estimate import estimate
 from smp_motor_ident.record import Hardware, Record
 
 STEP, SAMPLES, COUNTS = 0.01, 400, 500.0
-SHORT_SAMPLES = 100
-"""Samples whose estimate takes no longer than loading the compiled functions."""
+SHORT_SAMPLES = 100  # samples whose estimate takes no longer than loading the compiled functions
 MOTOR = MotorParameters(
     resistance=3.0, inductance=0.05, motor_constant=0.03, inertia=1.4e-5, viscous_friction=5e-5
 )

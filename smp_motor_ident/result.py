@@ -21,8 +21,7 @@ from smp_motor_ident.record import Hardware, NotNegative
 
 Status = Literal["estimated", "fixed", "unidentifiable"]
 
-NORMAL_95 = 1.959964
-"""Half the 95 % interval of a normal distribution, in standard deviations."""
+NORMAL_95 = 1.959964  # half the 95 % interval of a normal distribution, in standard deviations
 
 UNITS: Mapping[str, str] = {
     "resistance": "ohm",

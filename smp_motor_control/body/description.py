@@ -7,8 +7,7 @@ from xml.etree.ElementTree import Element, SubElement
 
 from smp_motor_control import joint_of
 
-WIDTH_PER_RADIUS = 0.4
-"""Width of a wheel and height of the box, in wheel radii; for display only."""
+WIDTH_PER_RADIUS = 0.4  # width of a wheel and height of the box, in wheel radii; for display only
 
 
 def robot_description(

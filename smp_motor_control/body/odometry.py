@@ -8,8 +8,7 @@ import numpy as np
 
 from smp_motor_control.errors import ParameterError, check_positive
 
-MIN_STEP_S = 1e-6
-"""Shortest time step that is integrated."""
+MIN_STEP_S = 1e-6  # shortest time step that is integrated
 
 
 class Odometry:

@@ -16,14 +16,12 @@ _UNITS = {
     "viscous_friction": "N m s/rad",
     "coulomb_friction": "N m",
 }
-PHYSICAL = tuple(_UNITS)
-"""Physical parameters."""
+PHYSICAL = tuple(_UNITS)  # physical parameters
 
 COMBINATIONS = ("dc_gain", "time_constant", "time_constant_product", "static_voltage")
 """Parameter combinations that voltage and speed identify."""
 
-SUPPLY_RANGE_V = (0.1, 1000.0)
-"""Range of supply voltages [V]."""
+SUPPLY_RANGE_V = (0.1, 1000.0)  # range of supply voltages [V]
 
 MAX_DELAY_S = 2.0
 """Maximum delay from voltage to effect; the observer stores voltages for this long."""

@@ -17,8 +17,7 @@ from smp_motor_control.nodes.robot_client import POLL_PERIOD_S, TIMEOUT_S, Robot
 from smp_motor_control.nodes.runtime import seconds
 
 BASELINE_S = 0.5  # observation of the old gains
-WINDOW_S = 0.4
-"""Assessed time span; the first assessment is this long after the change."""
+WINDOW_S = 0.4  # assessed time span; the first assessment is this long after the change
 
 MAX_SILENT_POLLS = 25
 """Polls without a report that show a stopped loop: half a second of this process's run time."""

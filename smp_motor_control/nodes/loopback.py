@@ -5,8 +5,7 @@ import os
 
 from smp_motor_control.motor.file import find_config
 
-FAST_DDS = "rmw_fastrtps"
-"""Jazzy's default middleware, for which the profile is written."""
+FAST_DDS = "rmw_fastrtps"  # jazzy's default middleware, for which the profile is written
 
 
 def loopback_environment() -> dict[str, str]:

@@ -13,8 +13,7 @@ from typing import Any
 
 from rclpy.node import Node
 
-DECISIVE_FALLS = 4
-"""Falls of the number within :data:`WINDOW_S` that show two publishers."""
+DECISIVE_FALLS = 4  # falls of the number within :data:`WINDOW_S` that show two publishers
 WINDOW_S = 1.0
 UNKNOWN_NODE = "_NODE_NAME_UNKNOWN_"
 """The middleware's name of a node whose endpoint is discovered first."""

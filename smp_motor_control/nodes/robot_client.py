@@ -37,8 +37,7 @@ from smp_motor_control.nodes.publishers import (
 )
 from smp_motor_control.nodes.runtime import LATCHED, STREAM_SUBSCRIBER, seconds, steady_timer
 
-TIMEOUT_S = 10.0
-"""Time-out of services and topics; on a busy machine discovery takes seconds."""
+TIMEOUT_S = 10.0  # time-out of services and topics; on a busy machine discovery takes seconds
 
 RETRY_PERIOD_S = 0.25
 """Period at which a request is repeated, as the answer is lost if the node has not yet discovered

@@ -23,8 +23,7 @@ from smp_motor_control.nodes.settings import Parameters
 from smp_motor_control.nodes.skid_steer_settings import Settings
 from smp_motor_control.wheel.stop import StopRule
 
-IMPLAUSIBLE_RATIO = 4.0
-"""Wheel speed relative to its maximum that shows a counter reset."""
+IMPLAUSIBLE_RATIO = 4.0  # wheel speed relative to its maximum that shows a counter reset
 DEFAULT_MAX_SPEED = 250.0  # plausible speed without a limit [rad/s]
 REPORT_TIME_S = 1.5  # time for which a refused command is reported, at least once
 LOOK_PERIOD_S = 0.2  # period of checking the publishers of cmd_vel

@@ -119,8 +119,7 @@ teleop_wheels: hold a key to drive; the wheels stop {timeout:g} s after it is re
   + -  faster, slower   m  body or wheel mode   space  stop   x or Ctrl-C  quit
 
 """
-ZERO_TIME_S = 1.0
-"""Time of zero commands after a key; then other nodes may drive."""
+ZERO_TIME_S = 1.0  # time of zero commands after a key; then other nodes may drive
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -8,11 +8,9 @@ from smp_motor_control.motor.parameters import MotorModel
 from smp_motor_control.pid import PidGains
 from smp_motor_control.reference.profile import Profile, Reference
 
-_INTERVAL_WINDOW = 5
-"""Number of intervals whose median is the usual one."""
+_INTERVAL_WINDOW = 5  # number of intervals whose median is the usual one
 
-_MIN_WEIGHT = 1e-12
-"""Acceleration feed-forward below this counts as zero."""
+_MIN_WEIGHT = 1e-12  # acceleration feed-forward below this counts as zero
 
 
 class ReferencePath:

@@ -16,14 +16,11 @@ from smp_motor_control.reference.time_optimal import Drive, VoltageLimited
 
 __all__ = ["UNLIMITED", "Drive", "Profile", "ProfileLimits", "Reference"]
 
-UNLIMITED = ProfileLimits()
-"""No limits: the reference jumps."""
+UNLIMITED = ProfileLimits()  # no limits: the reference jumps
 
-_MAX_TARGET = 1e9
-"""Maximum target [rad/s]; squares of it and its rates stay finite."""
+_MAX_TARGET = 1e9  # maximum target [rad/s]; squares of it and its rates stay finite
 
-_MIN_TRANSITION_S = 1e-6
-"""Shorter transition times count as zero."""
+_MIN_TRANSITION_S = 1e-6  # shorter transition times count as zero
 
 _STRETCH = 1.1
 _CHECK_POINTS = tuple(k / 32.0 for k in range(32))

@@ -21,8 +21,7 @@ from smp_motor_control.reference.minimum_jerk import Reference
 
 _ROUNDING_MARGIN = 1.0 + 1e-9
 _BISECTIONS = 60
-_MAX_FIRST_ORDER_RATIO = 1e-6
-"""Largest ``tp / tau^2`` of a motor treated as first order."""
+_MAX_FIRST_ORDER_RATIO = 1e-6  # largest ``tp / tau^2`` of a motor treated as first order
 
 
 @dataclass(frozen=True, kw_only=True)

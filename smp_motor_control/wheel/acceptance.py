@@ -32,8 +32,7 @@ thousandth of any encoder's resolution; of i, the same per millisecond."""
 MAX_SPEED_RATIO = 2.0
 """Maximum speed relative to the set-point: the peak of an undamped second-order loop."""
 
-TYPICAL_SUPPLY_V = 12.0
-"""Voltage assumed for a wheel with unknown supply and clamps."""
+TYPICAL_SUPPLY_V = 12.0  # voltage assumed for a wheel with unknown supply and clamps
 
 _FINE_ENCODER = Encoder(2.0**20)
 """Assumed for an unknown encoder, so that quantisation rejects no gains."""

@@ -11,20 +11,16 @@ from enum import Enum
 from smp_motor_control.errors import check_positive
 from smp_motor_control.fields import described
 
-MAX_TRIES = 3
-"""Retries of a wheel at fault before an operator must reset it."""
+MAX_TRIES = 3  # retries of a wheel at fault before an operator must reset it
 
-PROVEN_AFTER_S = 2.0
-"""Time of normal turning that ends a fault and clears its retries."""
+PROVEN_AFTER_S = 2.0  # time of normal turning that ends a fault and clears its retries
 
 TRUSTED_AFTER_S = 0.6
 """Time of normal turning after which a retry may use the full voltage; faults show earlier."""
 
-_RELEASE_TIME_S = 0.5
-"""Time of a zero set-point that releases a wheel."""
+_RELEASE_TIME_S = 0.5  # time of a zero set-point that releases a wheel
 
-_TRIAL_VOLTAGE_RATIO = 1.05
-"""Maximum voltage of a retry, relative to ``stall_voltage``."""
+_TRIAL_VOLTAGE_RATIO = 1.05  # maximum voltage of a retry, relative to ``stall_voltage``
 
 _MIN_ERROR = 0.3
 """Errors up to this are never a fault [rad/s]; one count at 1 kHz is 0.19 at the paper's wheel."""
@@ -38,8 +34,7 @@ _SATURATED_TOLERANCE = 0.7
 OVERLOAD_RATIO, OVERLOAD_TIME_S = 1.5, 1.5
 """Ratio of actual to needed voltage that counts as overload, and its minimum duration."""
 
-_GOOD_TRACKING_SHARE = 0.1
-"""Maximum relative error at which volts per speed are learnt."""
+_GOOD_TRACKING_SHARE = 0.1  # maximum relative error at which volts per speed are learnt
 
 
 class Fault(Enum):

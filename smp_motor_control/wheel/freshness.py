@@ -10,8 +10,7 @@ from enum import Enum
 CLOCK_JUMP_S = 1.0
 """An age beyond this is a clock jump rather than a delay, unless the stamps are continuous."""
 
-_MAX_CLOCK_SKEW_S = 0.1
-"""Maximum time between readings of two clocks at one instant."""
+_MAX_CLOCK_SKEW_S = 0.1  # maximum time between readings of two clocks at one instant
 
 
 class Verdict(Enum):

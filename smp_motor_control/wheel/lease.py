@@ -5,14 +5,11 @@ import math
 
 from smp_motor_control.wheel.freshness import FeedbackClock, Verdict
 
-MAX_LEASE_S = 1.0
-"""Maximum duration of a lease."""
+MAX_LEASE_S = 1.0  # maximum duration of a lease
 
-MAX_WRITERS = 64
-"""Maximum number of writers whose clocks and refusals are stored."""
+MAX_WRITERS = 64  # maximum number of writers whose clocks and refusals are stored
 
-OTHER_WRITERS = "others"
-"""Name under which refused commands of further writers are counted."""
+OTHER_WRITERS = "others"  # name under which refused commands of further writers are counted
 
 
 class Lease:

@@ -23,11 +23,9 @@ from smp_motor_control.wheel.stop import MAX_STOP_TIME_S
 
 SPEED_SOURCES = ("measured", "difference", "observer")
 
-MAX_TRANSITION_S = 60.0
-"""Maximum duration of a change of set-point."""
+MAX_TRANSITION_S = 60.0  # maximum duration of a change of set-point
 
-INTERVAL_SAMPLES = 20
-"""Number of samples from which the observer's interval is learnt."""
+INTERVAL_SAMPLES = 20  # number of samples from which the observer's interval is learnt
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -10,41 +10,31 @@ from collections import deque
 from collections.abc import Sequence
 from typing import NamedTuple
 
-MIN_AMPLITUDE = 0.3
-"""Amplitudes up to this are ignored [rad/s], as by the fault detector."""
+MIN_AMPLITUDE = 0.3  # amplitudes up to this are ignored [rad/s], as by the fault detector
 
 MIN_AMPLITUDE_SHARE = 0.25
 """Amplitudes up to this fraction of the reference are ignored: position-dependent loads."""
 
-MIN_SWING_COUNTS = 3.0
-"""Minimum travel of half a period [counts], above quantisation."""
+MIN_SWING_COUNTS = 3.0  # minimum travel of half a period [counts], above quantisation
 
-MIN_SWING_RAD = 0.01
-"""The same for an unknown encoder [rad]."""
+MIN_SWING_RAD = 0.01  # the same for an unknown encoder [rad]
 
-HALF_SWINGS = 10
-"""Number of consecutive half periods that show an oscillation."""
+HALF_SWINGS = 10  # number of consecutive half periods that show an oscillation
 
-MAX_PERIOD_SCATTER = 0.3
-"""Maximum relative standard deviation of the periods; noise has more."""
+MAX_PERIOD_SCATTER = 0.3  # maximum relative standard deviation of the periods; noise has more
 
 MIN_SMOOTHNESS = 0.75
 """Minimum ratio of error to second difference: 0.41 for white noise, 1 for six-sample cycles."""
 
-SMOOTHNESS_MEMORY_S = 0.5
-"""Averaging time of that ratio."""
+SMOOTHNESS_MEMORY_S = 0.5  # averaging time of that ratio
 
-OFFSET_MEMORY_S = 1.0
-"""Averaging time of the constant error, as without integral action."""
+OFFSET_MEMORY_S = 1.0  # averaging time of the constant error, as without integral action
 
-MIN_DURATION_S = 1.0
-"""Minimum duration; ringing after a change of set-point is shorter."""
+MIN_DURATION_S = 1.0  # minimum duration; ringing after a change of set-point is shorter
 
-END_AFTER_S = 3.0
-"""Time without a reversal that ends the oscillation."""
+END_AFTER_S = 3.0  # time without a reversal that ends the oscillation
 
-STEADY_SHARE = 0.1
-"""Tolerated change of a steady reference, as a fraction and in rad/s."""
+STEADY_SHARE = 0.1  # tolerated change of a steady reference, as a fraction and in rad/s
 
 
 class Swing(NamedTuple):

@@ -13,8 +13,7 @@ _DEFAULT_JUMP_SHARE = 0.5
 _UNKNOWN_MOTOR_JUMP, _UNKNOWN_MOTOR_SHARE = 10.0, 3.0
 """Plausible jump for an unknown motor: constant [rad/s] plus a multiple of actual or set speed."""
 
-LOAD_SHARE = 0.25
-"""Voltage of a load, as a fraction of the maximum."""
+LOAD_SHARE = 0.25  # voltage of a load, as a fraction of the maximum
 
 _MAX_QUIET_CHANGE = 0.2
 """Mean change between readings, relative to the plausible one, below which a jump is an outlier;

@@ -3,8 +3,7 @@
 
 from dataclasses import dataclass
 
-PERSISTENCE_S = 0.05
-"""Time above a limit that ends the test; a single bad sample does not."""
+PERSISTENCE_S = 0.05  # time above a limit that ends the test; a single bad sample does not
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -11,11 +11,9 @@ import math
 STANDSTILL_SETPOINT = 1e-3
 """Set-points up to this count as zero [rad/s], such as those of a joystick at rest."""
 
-REST_SPEED = 0.05
-"""Speeds up to this count as standstill [rad/s]."""
+REST_SPEED = 0.05  # speeds up to this count as standstill [rad/s]
 
-MAX_STOP_TIME_S = 10.0
-"""Maximum of ``stop_time``."""
+MAX_STOP_TIME_S = 10.0  # maximum of ``stop_time``
 
 AVERAGING_WINDOW_S = 0.5
 """Averaging time of voltage and speed: a few counts of a coarse encoder at ``REST_SPEED``."""

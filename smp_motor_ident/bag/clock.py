@@ -19,16 +19,13 @@ from smp_motor_ident.errors import BagError
 Parts = list[tuple[int, int]]
 """Begin and end of runs of rows."""
 
-MISSING_TIME = -(2**62)
-"""Time of a row without one."""
+MISSING_TIME = -(2**62)  # time of a row without one
 
 _ROWS = round(MIN_RESTART_ROWS.value)
-_BEFORE = 1000
-"""Smallest number of earlier rows examined."""
+_BEFORE = 1000  # smallest number of earlier rows examined
 
 _SECOND = 1_000_000_000
-BEAT_SAMPLES = 32
-"""Samples that determine a beat."""
+BEAT_SAMPLES = 32  # samples that determine a beat
 MAX_CLOCK_OFFSET_NS = 50_000_000
 """Topics whose offsets differ by less [ns] share a clock; latency explains the difference."""
 

@@ -15,8 +15,7 @@ from smp_motor_ident.finding import Severity
 from smp_motor_ident.simulate.motion import Motion
 from smp_motor_ident.simulate.rows import Rows
 
-LEAST_LAG = 0.005
-"""Second lag over the first from which it may be that of another component."""
+LEAST_LAG = 0.005  # second lag over the first from which it may be that of another component
 
 Values = Mapping[str, Array]
 """Parameters by their names, each for every lane."""

@@ -19,8 +19,7 @@ from smp_motor_ident.tune.methods.rules import by_rule
 
 BIAS_SHARE = 0.4
 """Share of the supply around which the relay switches, so that friction is not crossed."""
-MAX_GAP_SHARE = 0.25
-"""Share of a cycle without a sample from which a recording is split."""
+MAX_GAP_SHARE = 0.25  # share of a cycle without a sample from which a recording is split
 SIGNALS = ("time", "voltage", "applied", "speed", "angle")
 
 

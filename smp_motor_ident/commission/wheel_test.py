@@ -19,11 +19,9 @@ from smp_motor_ident.commission.wheel_limits import (
 )
 from smp_motor_ident.record import Hardware
 
-MIN_HOLD_S = 0.4
-"""Shortest time for which a voltage is held [s]."""
+MIN_HOLD_S = 0.4  # shortest time for which a voltage is held [s]
 
-ENCODER_DITHER = 1.0
-"""Counts between which an encoder at rest on an edge toggles."""
+ENCODER_DITHER = 1.0  # counts between which an encoder at rest on an edge toggles
 
 
 @dataclass(frozen=True, eq=False)

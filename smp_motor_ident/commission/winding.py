@@ -27,12 +27,10 @@ from smp_motor_ident.finding import Finding
 from smp_motor_ident.live.monitor import BLOCK_S, COPPER_COEFFICIENT
 from smp_motor_ident.record import Record
 
-MIN_DEVIATIONS = 3.0
-"""Required excess over the limit [standard deviations]."""
+MIN_DEVIATIONS = 3.0  # required excess over the limit [standard deviations]
 
 
-MAX_CONDITION = 1e6
-"""Condition number beyond which the columns of a recording are collinear."""
+MAX_CONDITION = 1e6  # condition number beyond which the columns of a recording are collinear
 
 
 class Resistance(NamedTuple):

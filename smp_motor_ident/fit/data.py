@@ -24,8 +24,7 @@ from smp_motor_ident.quality.standstill import stands
 from smp_motor_ident.record import Record
 from smp_motor_ident.simulate.rows import Rows
 
-SEARCH_ROWS = 4000
-"""Rows on which the chain is sought; it is fitted to all."""
+SEARCH_ROWS = 4000  # rows on which the chain is sought; it is fitted to all
 ALIKE = 0.01
 """Share of the largest command by which commands of one row may differ where rows are left out."""
 

@@ -34,16 +34,11 @@ from smp_motor_ident.fit.start import guesses
 
 SEARCH_ORDER = 2
 """Order of the noise model during the search; a higher one would absorb missing components."""
-RESOLVED = 1.1
-"""Residual over the rounding of an encoder up to which it is rounding."""
-CLEARLY = 0.3
-"""Gain by screening over that of another's fit, below which a component waits for it."""
-ROUGH = 0.3
-"""Change of the deviance at which a fit of the search ends."""
-CERTAIN = 20.0
-"""Deviations from none at which a component is needed without a fit that says so."""
-NEEDED = ("friction", "asymmetric_friction")
-"""Components that every motor has."""
+RESOLVED = 1.1  # residual over the rounding of an encoder up to which it is rounding
+CLEARLY = 0.3  # gain by screening over that of another's fit, below which a component waits for it
+ROUGH = 0.3  # change of the deviance at which a fit of the search ends
+CERTAIN = 20.0  # deviations from none at which a component is needed without a fit that says so
+NEEDED = ("friction", "asymmetric_friction")  # components that every motor has
 
 Say = Callable[[str], None]
 

@@ -39,10 +39,8 @@ CAUSES = {
 }  # fmt: skip
 """Names of the systematic uncertainty that rests on the prior of a parameter."""
 MAX_SHARES = 3
-LEAST_SHARE = 1e-6
-"""Share of a number below which a systematic uncertainty is none."""
-WORTH = 0.25
-"""Systematic over random uncertainty from which it is stated."""
+LEAST_SHARE = 1e-6  # share of a number below which a systematic uncertainty is none
+WORTH = 0.25  # systematic over random uncertainty from which it is stated
 
 
 @dataclass(frozen=True, eq=False)

@@ -40,18 +40,15 @@ PLAIN = (
     "current",
 )
 """Components without a finding."""
-STANDING = 0.9
-"""Share of white noise in a motion above which the motor is at rest."""
+STANDING = 0.9  # share of white noise in a motion above which the motor is at rest
 SIGNIFICANT = 3.0
 """Standard deviations by which a size differs from zero before a warning is given of it."""
 UNTOLD = ("current_offset", "vc", "eccentric_phase")
 """Parameters omitted from messages about their component."""
-DISAGREEMENT = 2.5
-"""Scatter between parts of a record, over chance, that is said."""
+DISAGREEMENT = 2.5  # scatter between parts of a record, over chance, that is said
 FINE = 0.02
 """Relative standard deviation by such a scatter up to which a number serves all the same."""
-UNUSABLE = 0.2
-"""Relative standard deviation by such a scatter from which a number is unreliable."""
+UNUSABLE = 0.2  # relative standard deviation by such a scatter from which a number is unreliable
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,11 +13,9 @@ from smp_motor_ident.fit.start import command_of
 from smp_motor_ident.quality.limits import REST, SAME_LEVEL
 
 MIN_SWINGS = 6
-MANY_CHANGES = 0.2
-"""Share of the rows: a command that changes in more of them makes no steps."""
+MANY_CHANGES = 0.2  # share of the rows: a command that changes in more of them makes no steps
 
-COASTING = 0.2
-"""Share of the largest speed from which a motor without voltage coasts."""
+COASTING = 0.2  # share of the largest speed from which a motor without voltage coasts
 
 
 @dataclass(frozen=True)

@@ -30,8 +30,7 @@ VISCOUS_SHARES = (0.03, 0.3, 0.7, 0.97)
 LARGEST_RESISTANCE = 15.0  # [ohm] allowed for where it is not known either
 SPREADS = (0.5, 2.0, 6.0)
 TRIAL_LENGTH = 10.0  # [s]
-COARSE_ANGLE = 0.01
-"""Standard deviation [rad] of an angle whose counts are not known."""
+COARSE_ANGLE = 0.01  # standard deviation [rad] of an angle whose counts are not known
 
 
 @dataclass(frozen=True)

@@ -51,11 +51,9 @@ HANN = 1 + 2 * (2 / 3) ** 2 + 2 * (1 / 6) ** 2
 """Lines under a Hann window that equal one independent line: neighbours correlate by 2/3, the next
 by 1/6."""
 
-ROUNDING = 1e-14
-"""Share of a sum of squares that rounding leaves."""
+ROUNDING = 1e-14  # share of a sum of squares that rounding leaves
 
-FIRST = 2
-"""Lines from 0 that the window fills with the mean."""
+FIRST = 2  # lines from 0 that the window fills with the mean
 
 
 def estimate_model_error(

@@ -21,8 +21,7 @@ from smp_motor_ident.fit.start import filled
 from smp_motor_ident.record import Record
 from smp_motor_ident.result import Estimate, FitPercent
 
-COARSE = 0.02
-"""Share of the speed's scatter that differences of a coarse angle may add to it."""
+COARSE = 0.02  # share of the speed's scatter that differences of a coarse angle may add to it
 FITTED_SHARE = 0.7
 MIN_ROWS = 25
 

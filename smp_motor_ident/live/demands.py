@@ -9,8 +9,7 @@ from smp_motor_control.arrays import Array
 from smp_motor_control.fields import described
 from smp_motor_ident.record import Record
 
-ROUNDING = 1e-9
-"""Relative rounding error of equal voltages computed in different ways."""
+ROUNDING = 1e-9  # relative rounding error of equal voltages computed in different ways
 
 
 @dataclass(frozen=True)

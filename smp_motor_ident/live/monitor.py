@@ -44,11 +44,9 @@ three seconds is followed within some ten."""
 PRIOR_STD = {"resistance": 0.3, "motor_constant": 0.1, "inductance": 0.01, "friction": 1.0}
 """Relative standard deviations of the prior; iron, and so the inductance, hardly changes."""
 
-MAX_DEVIATIONS = 4.0
-"""Standard deviations beyond which a block is left out: a bad sample, a blow."""
+MAX_DEVIATIONS = 4.0  # standard deviations beyond which a block is left out: a bad sample, a blow
 
-COPPER_COEFFICIENT = 0.00393
-"""Temperature coefficient of copper's resistance [1/K]."""
+COPPER_COEFFICIENT = 0.00393  # temperature coefficient of copper's resistance [1/K]
 
 
 @dataclass(frozen=True)

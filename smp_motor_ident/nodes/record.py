@@ -34,8 +34,7 @@ from smp_motor_ident.nodes.bag_arguments import Choice, chosen, message_class, q
 
 TAKE_PERIOD = 0.004
 LOOK_PERIOD = 0.05
-DEPTH = 2000
-"""Depth of the DDS queue per topic: two seconds of 1 kHz while the disk is busy."""
+DEPTH = 2000  # depth of the DDS queue per topic: two seconds of 1 kHz while the disk is busy
 
 
 ONE_PUBLISHER = ("smp_interfaces/msg/MotorState", "smp_interfaces/msg/PidState")

@@ -10,19 +10,15 @@ import numpy as np
 from smp_motor_control.arrays import Array, Flags, Integers
 from smp_motor_ident.record import Record
 
-REST = 10
-"""Samples after which an unchanged count counts as standstill."""
+REST = 10  # samples after which an unchanged count counts as standstill
 FINEST_ENCODER = 2 * np.pi / 2**17
 """Resolution [rad] of the encoders of servos, finer than those of any wheel."""
-FINEST_SENSOR = 1e-4
-"""Of its range: what shunt amplifiers and tachometers are linear to at best."""
-FEW = 2_000
-"""Samples that tell whether a speed repeats its values."""
+FINEST_SENSOR = 1e-4  # of its range: what shunt amplifiers and tachometers are linear to at best
+FEW = 2_000  # samples that tell whether a speed repeats its values
 MANY = 30
 """Levels of moves that tell a step by being near whole ones on the mean, each off by a part of it
 as a log of seven digits makes them: five deviations from chance."""
-UNIFORM = 0.25
-"""Mean distance of a random number from the nearest whole number."""
+UNIFORM = 0.25  # mean distance of a random number from the nearest whole number
 
 
 def angle_of(record: Record) -> tuple[Array, float] | None:

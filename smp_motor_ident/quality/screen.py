@@ -128,8 +128,7 @@ def _excitation(records: Sequence[Record], where: str) -> None:
         )
 
 
-LEAST_MEANS = 12
-"""Of a record, from which their scatter is known."""
+LEAST_MEANS = 12  # of a record, from which their scatter is known
 
 
 def _starts(record: Record) -> bool:

@@ -25,11 +25,9 @@ from smp_motor_ident.quality.limits import (
 from smp_motor_ident.quality.sample_limits import BEAT_FLOOR, BEAT_JITTER, BEAT_LOST, SMOOTHER
 from smp_motor_ident.record import Record
 
-_PAUSE = 20_000_000
-"""Shortest silence [ns] that divides arrivals."""
+_PAUSE = 20_000_000  # shortest silence [ns] that divides arrivals
 BLOCKS = 8
-_LEAST = 50
-"""Samples below which a beat is not looked for."""
+_LEAST = 50  # samples below which a beat is not looked for
 
 
 @dataclass(frozen=True, eq=False)

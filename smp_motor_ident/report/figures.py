@@ -17,8 +17,7 @@ VIEW_LAGS = 80.0  # lags of the motor that a screen shows at first: single answe
 MIN_COHERENCE = 0.6
 """Below this coherence most of the spectrum at a frequency is not the response to the voltage."""
 
-MAX_MISSING_INTERVALS = 20.0
-"""Missing intervals after which a new spectrum begins."""
+MAX_MISSING_INTERVALS = 20.0  # missing intervals after which a new spectrum begins
 
 Role = Literal["estimation", "validation"]
 

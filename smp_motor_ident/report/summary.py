@@ -8,8 +8,7 @@ from smp_motor_ident.finding import SEVERITIES, Finding
 from smp_motor_ident.report.words import is_told, put_within, to_sentence
 from smp_motor_ident.result import Estimate, Quantity
 
-MAX_MESSAGES = 3
-"""So many are shown of a motor without being asked for; more are not read."""
+MAX_MESSAGES = 3  # so many are shown of a motor without being asked for; more are not read
 
 
 @dataclass(frozen=True)

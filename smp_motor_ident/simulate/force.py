@@ -15,8 +15,7 @@ from smp_motor_ident.simulate.lanes import (
     STRIBECK_SPEED,
 )
 
-SOON = 0.01
-"""Share of the record within which a load sets in."""
+SOON = 0.01  # share of the record within which a load sets in
 
 
 @compiled

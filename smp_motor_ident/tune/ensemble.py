@@ -11,8 +11,7 @@ from smp_motor_ident.tune.margins import BatchMargins, batch_margins, grid_for
 from smp_motor_ident.tune.plant import Plant
 from smp_motor_ident.tune.problem import Problem, RequiredMargins
 
-REQUIRED_SHARE = 0.99
-"""Share of the distribution for which the required margins must hold."""
+REQUIRED_SHARE = 0.99  # share of the distribution for which the required margins must hold
 
 
 @dataclass(frozen=True)

@@ -21,8 +21,7 @@ from smp_motor_ident.tune.limits import LOOP_RATE_TOLERANCE, MAX_COMMAND_ERROR, 
 Step = Callable[[float, float], float]
 """From set-point, in the target's unit, and speed of the wheel [rad/s] to the command [V]."""
 
-INTERVAL_TOLERANCE = 0.5
-"""Relative excess of an interval that indicates a lost sample."""
+INTERVAL_TOLERANCE = 0.5  # relative excess of an interval that indicates a lost sample
 
 DITHER_COUNT = 4
 

@@ -36,11 +36,9 @@ from smp_motor_ident.errors import DesignError
 from smp_motor_ident.tune.loop import Loop
 from smp_motor_ident.tune.motors import Motors
 
-MAX_LOOP_SAMPLES = 300
-"""Largest delay and averaging of a loop [samples]."""
+MAX_LOOP_SAMPLES = 300  # largest delay and averaging of a loop [samples]
 
-SPEED = 1
-"""Where the speed is in the state."""
+SPEED = 1  # where the speed is in the state
 
 
 @dataclass(frozen=True, eq=False)

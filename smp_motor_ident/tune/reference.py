@@ -35,11 +35,9 @@ from smp_motor_ident.tune.simulation import Controller, Inputs, simulate, step_f
 STEADY_VOLTAGE_SHARE = 0.92
 """Share of the supply that a constant speed may use; the rest is left to the feedback."""
 
-PEAK_VOLTAGE_SHARE = 0.95
-"""Share of the supply that a planned change of speed may use at its peak."""
+PEAK_VOLTAGE_SHARE = 0.95  # share of the supply that a planned change of speed may use at its peak
 
-STEP_SHARE = 0.5
-"""Share of the largest speed that the figures of a design are about."""
+STEP_SHARE = 0.5  # share of the largest speed that the figures of a design are about
 
 
 @dataclass(frozen=True)

@@ -46,8 +46,7 @@ from smp_motor_ident.tune.limits import (
 from smp_motor_ident.tune.plant import Plant
 from smp_motor_ident.tune.simulation import settling_time
 
-FREQUENCY_COUNT = 40
-"""Number of resonance frequencies, from the lowest of the bound up to Nyquist."""
+FREQUENCY_COUNT = 40  # number of resonance frequencies, from the lowest of the bound up to Nyquist
 
 DAMPINGS = np.geomspace(RESONANCE_DAMPING.value, MAX_RESONANCE_DAMPING.value, 4)
 """Of resonances, evenly spread over those of shafts."""

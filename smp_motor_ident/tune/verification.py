@@ -35,17 +35,13 @@ from smp_motor_ident.tune.limits import (
 from smp_motor_ident.tune.motors import draw_motors, motors_of
 from smp_motor_ident.tune.simulation import settling_time
 
-SMOOTHING_S = 0.05
-"""Length [s] of the parabola whose slope is taken as the speed."""
+SMOOTHING_S = 0.05  # length [s] of the parabola whose slope is taken as the speed
 
-STEADY_TIME_S = 0.3
-"""End of a change that is taken as steady [s]."""
+STEADY_TIME_S = 0.3  # end of a change that is taken as steady [s]
 
-DRAWS = 12
-"""Motors in addition to the nominal one."""
+DRAWS = 12  # motors in addition to the nominal one
 
-MAX_UNKNOWN_SHARE = 0.1
-"""Largest share of samples whose voltage matches no command."""
+MAX_UNKNOWN_SHARE = 0.1  # largest share of samples whose voltage matches no command
 
 _TIME = "raise the scheduling_priority of the wheels' nodes, and reduce the load of the network"
 
@@ -54,8 +50,7 @@ _WHEEL = (
     "motor that changed since; then commission again"
 )
 
-RESOLUTION_SIGMAS = 3.0
-"""Of the speed's resolution that a reading may be off."""
+RESOLUTION_SIGMAS = 3.0  # of the speed's resolution that a reading may be off
 
 
 @dataclass(frozen=True)

@@ -26,8 +26,7 @@ from smp_motor_ident.tune.known_loop import KnownLoop, Setting, Step
 from smp_motor_ident.tune.limits import SETTLING_BAND
 from smp_motor_ident.tune.margins import batch_margins, grid_for
 
-MAX_PWM = 255
-"""Of eight bits, as Arduino's `analogWrite` takes it."""
+MAX_PWM = 255  # of eight bits, as Arduino's `analogWrite` takes it
 
 
 # ros2_controllers: ``pid_controller`` with the gains of control_toolbox, Jazzy.

@@ -68,8 +68,7 @@ class Check:
     resting_error: float  # largest error at rest as a share of that change [-]
 
 
-MILLISECOND = 1e-3
-"""Tolerance for whole milliseconds, since rates have six digits."""
+MILLISECOND = 1e-3  # tolerance for whole milliseconds, since rates have six digits
 
 
 def plant_of(design: Design) -> Plant:

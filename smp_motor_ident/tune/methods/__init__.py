@@ -7,5 +7,4 @@ from smp_motor_ident.tune.methods.relay import RELAY
 from smp_motor_ident.tune.methods.rules import SIMC, TYREUS_LUYBEN, ZIEGLER_NICHOLS
 
 _ALL = MARGIN, POLE_PLACEMENT, SIMC, ZIEGLER_NICHOLS, TYREUS_LUYBEN, RELAY
-METHODS = {method.name: method for method in _ALL}
-"""Every method by its name."""
+METHODS = {method.name: method for method in _ALL}  # every method by its name

@@ -25,11 +25,9 @@ from smp_motor_ident.tune.methods.rules import from_ultimate
 from smp_motor_ident.tune.problem import Method, Problem, RequiredMargins
 
 MIN_CYCLES = 4
-CYCLE_TOLERANCE = 0.25
-"""Relative tolerance for the length of a cycle."""
+CYCLE_TOLERANCE = 0.25  # relative tolerance for the length of a cycle
 
-TRANSIENT_CYCLES = 5
-"""Cycles after which an oscillation is steady, where as many are there."""
+TRANSIENT_CYCLES = 5  # cycles after which an oscillation is steady, where as many are there
 
 
 def oscillate(
