@@ -291,8 +291,6 @@ def descend(
         values = _apply_step(at, scales, step)
         taken = np.array([values[p.name] - at.values[p.name] for p in at.free])
         expected = float(taken @ (2 * linear.columns.T @ linear.residual - linear.normal @ taken))
-        if 0 <= expected < 0.1 * min(CONVERGED, converged):
-            break
         trial = at.with_values(values)
         trial_start = _settle_states(start, linear, taken)
         following = linearise(data, trial, scales, trial_start, noise)
@@ -377,8 +375,6 @@ def fit(
     least = max(10 * converged, 1.0)
     for _ in range(rounds):
         noise = fit_noises(data, found.linear, most)
-        if _likelier_by(data, found, noise) < least:
-            break
         other = descend(data, found.chain, scales, found.initial, noise, converged=converged)
         gained = _information_criterion(data, found) - _information_criterion(data, other)
         if gained > 0:
@@ -386,19 +382,6 @@ def fit(
         if gained < least:
             break
     return found
-
-
-def _likelier_by(data: Data, found: Fit, noise: Sequence[Noise]) -> float:
-    """Return the decrease of the information criterion by another noise of the same residual."""
-    total = 0.0
-    every = zip(data.outputs, found.linear.simulated, data.known, strict=True)
-    for k, (measured, simulated, known) in enumerate(every):
-        rest = (measured - simulated)[None, known]
-        for sign, its in ((1, found.noise[k]), (-1, noise[k])):
-            white = its.whiten(rest, _runs(data, k, its))[0]
-            price = its.order * math.log(max(known.size, 2))
-            total += sign * (float(white @ white) + its.log_determinant(data.runs[k]) + price)
-    return total
 
 
 def refine(data: Data, found: Fit) -> Fit:

@@ -233,7 +233,7 @@ def _fit_simplest(data: Data, policy: SelectionPolicy) -> Fit:
 
 
 def _fit_starts(data: Data, chains: Sequence[Chain], policy: SelectionPolicy) -> list[Fit]:
-    """Return the fit that begins at the best of some guesses, if there are any."""
+    """Return the fits that begin at guesses, the best first."""
     firsts = []
     for chain in chains:
         scales = data.scales(math.exp(chain.values["ln_a1"] - chain.values["ln_a0"]))
@@ -243,8 +243,9 @@ def _fit_starts(data: Data, chains: Sequence[Chain], policy: SelectionPolicy) ->
         firsts.append(
             fit(data, chain, scales, data.initial, rounds=2, most=SEARCH_ORDER, converged=ROUGH)
         )
-    firsts.sort(key=lambda f: f.deviance)
-    return firsts[:1] if policy.first_order else [_second_order(data, f) for f in firsts[:1]]
+    distinct = {round(f.deviance): f for f in firsts}.values()  # several end at one minimum
+    fits = distinct if policy.first_order else [_second_order(data, f) for f in distinct]
+    return sorted(fits, key=lambda f: f.deviance)
 
 
 def plain_sensor(data: Data) -> tuple[Component, Mapping[str, float]]:
