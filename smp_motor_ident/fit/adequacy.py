@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Whether a chain explains a recording: scatter of the score between parts of it.
+"""Test the adequacy of a chain by the scatter of the score between parts of a record.
 
 Where the chain is right, the gradient of the likelihood over any part of the record is noise of a
-known covariance.  More scatter says that parts of the record, or regimes of the motion, ask for
+known covariance.  More scatter shows that parts of the record, or regimes of the motion, need
 other parameters.
 
 References
@@ -25,7 +25,7 @@ from smp_motor_ident.fit.descend import Fit
 from smp_motor_ident.fit.start import command_of
 
 BLOCKS = 24
-SIGNIFICANT = 2.0  # standard deviations of a scatter that chance does not explain
+SIGNIFICANT = 2.0  # standard deviations by which a scatter exceeds chance
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,9 +45,9 @@ def scatters(data: Data, found: Fit) -> list[Scatter]:
 
 
 def partitions(data: Data, found: Fit) -> Iterator[tuple[str, Integers]]:
-    """Yield labels of rows whose scores are independent where the chain is right.
+    """Yield labels of rows that have independent scores if the chain is right.
 
-    They are taken from the simulated motion: that measured shares its noise with the residual.
+    They follow the simulated motion, as the measured one shares its noise with the residual.
     """
     n = len(data)
     yield "autocorrelation", np.arange(n) * BLOCKS // n
@@ -68,7 +68,7 @@ def partitions(data: Data, found: Fit) -> Iterator[tuple[str, Integers]]:
 
 
 def scatter(found: Fit, name: str, label: Integers) -> Scatter | None:
-    """Return the scatter between the parts that labels tell apart."""
+    """Return the scatter between labelled parts."""
     linear = found.linear
     m, p = linear.row.size, linear.columns.shape[1]
     count = int(label.max()) + 1
@@ -85,7 +85,7 @@ def scatter(found: Fit, name: str, label: Integers) -> Scatter | None:
     statistic = dof = 0.0
     for k in range(count):
         share = expected[k]
-        # The scores sum to zero: each is known less the part that the fit took up.
+        # The scores sum to zero, so the covariance of each lacks the part of the fit.
         own = share - share @ inverse @ share
         scale = np.sqrt(np.maximum(np.diag(share), 1e-300))
         if not np.isfinite(own).all() or not np.isfinite(sums[k]).all():
@@ -101,7 +101,7 @@ def scatter(found: Fit, name: str, label: Integers) -> Scatter | None:
         return None
     values, vectors = np.linalg.eigh(_symmetric(inverse @ spread @ inverse))
     excess = (vectors * np.maximum(values, 0.0)) @ vectors.T
-    # Stretches of time scatter by what no regime tells, such as instants of commands.
+    # Stretches of time also scatter by effects outside all regimes, such as late commands.
     least = 0.0 if name == "autocorrelation" else SIGNIFICANT
     significant = (statistic - dof) / math.sqrt(2 * dof) > least
     return Scatter(name, statistic / dof, significant, excess)
