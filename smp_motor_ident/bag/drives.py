@@ -2,10 +2,10 @@
 """Test whether one signal drives another, to find a voltage and its motion among fields."""
 
 from itertools import product
+from statistics import NormalDist
 
 import numpy as np
-from scipy.fft import irfft, next_fast_len, rfft
-from scipy.special import fdtrc, ndtri
+from numpy.fft import irfft, rfft
 
 from smp_motor_control.arrays import Array, Integers
 from smp_motor_ident.bag.limits import (
@@ -32,6 +32,8 @@ def find_unexplained_share(u: Array, y: Array) -> float | None:
     Its past must predict the motion better than the motion's own past does (Granger's test, an F
     test of two nested regressions).
     """
+    from scipy.special import fdtrc  # takes a while to load
+
     if y.size < 5 * (LAGS + OWN) or not (np.std(y) > 0 and np.std(u) > 0):
         return None
     y, u = (y - y.mean()) / np.std(y), (u - u.mean()) / np.std(u)
@@ -64,7 +66,7 @@ def responds_in_its_row(u: Array, y: Array) -> bool:
     size = steps[new + 1]
     at_once, later = float(size @ jumps[new]), float(size @ jumps[new + 1])
     scatter = float(np.nanstd(np.delete(jumps, new)) * np.linalg.norm(size))
-    return at_once > max(-float(ndtri(EXPLANATION_LEVEL.value)) * scatter, later)
+    return at_once > max(-NormalDist().inv_cdf(EXPLANATION_LEVEL.value) * scatter, later)
 
 
 def find_following_share(u: Array, y: Array) -> tuple[float, bool]:
@@ -124,7 +126,7 @@ def find_late_rows(u: Array, y: Array) -> int:
 def _explained_shares_by_shift(x: Array, y: Array, shifts: Integers) -> Array:
     """Return the share of ``y[k]`` explained by a multiple of ``x[k + shift]`` at each shift."""
     x = x - x.mean()
-    size = next_fast_len(x.size + y.size, real=True)
+    size = 1 << (x.size + y.size).bit_length()
     both = irfft(rfft(x, size) * np.conj(rfft(y, size)), size)[shifts]
     own, moved = (np.concatenate([[0.0], np.cumsum(v**2)]) for v in (x, y))
     begin, end = np.maximum(shifts, 0), y.size + np.minimum(shifts, 0)
@@ -136,14 +138,16 @@ def _residual_share(u: Array, y: Array, shift: int, lag: float) -> float:
     """Return the unexplained share of a motion for a shifted command with lag and friction."""
     u, y = (u[shift:], y[: y.size - shift]) if shift > 0 else (u[: u.size + shift], y[-shift:])
     every = max(y.size // MAX_FIT_ROWS, 1)
+    some = y[::every]
     best = np.inf
     for trial, second in product(lag * np.geomspace(0.4, 2.5, 25), SECOND_LAG_ROWS):
         columns = (lagged(u, trial), lagged(np.sign(y), trial), np.ones(y.size))
         columns = (lagged(columns[0], second), *columns[1:])
-        matrix = np.stack(columns, axis=1)[::every]
-        rest = np.linalg.lstsq(matrix, y[::every], rcond=None)[1]
-        best = min(best, float(rest[0]) if rest.size else np.inf)
-    return best / float(np.sum((y[::every] - y[::every].mean()) ** 2))
+        matrix = np.stack(columns)[:, ::every]
+        both = matrix @ some
+        multiples = np.linalg.lstsq(matrix @ matrix.T, both, rcond=None)[0]
+        best = min(best, float(some @ some - both @ multiples))
+    return best / float(np.sum((some - some.mean()) ** 2))
 
 
 def find_lagged_share(u: Array, y: Array) -> float:

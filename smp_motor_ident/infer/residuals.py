@@ -10,9 +10,9 @@ from __future__ import annotations
 
 import math
 from itertools import pairwise
+from statistics import NormalDist
 
 import numpy as np
-from scipy.special import ndtri
 
 from smp_motor_control.arrays import Array
 from smp_motor_ident.fit.data import Data
@@ -70,7 +70,7 @@ def _centre(error: Array) -> tuple[Array, float]:
     if n < 4 * LAGS:
         return np.zeros(LAGS + 1), np.inf
     e = np.where(ok, error - error[ok].mean(), 0.0)[:MAX_ROWS]
-    return e, float(ndtri(1 - RESIDUAL_LEVEL.value / 2 / LAGS) / np.sqrt(n))
+    return e, NormalDist().inv_cdf(1 - RESIDUAL_LEVEL.value / 2 / LAGS) / math.sqrt(n)
 
 
 def _lagged(a: Array, b: Array) -> Array:

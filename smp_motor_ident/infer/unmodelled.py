@@ -36,7 +36,6 @@ from itertools import pairwise
 from typing import Any
 
 import numpy as np
-from scipy.special import fdtri
 
 from smp_motor_control.arrays import Array, Complex, Integers
 from smp_motor_ident.infer.response_limits import (
@@ -159,7 +158,9 @@ def _circles(error: Complex, outputs: Complex, level: Array) -> tuple[Array, Arr
     # Residual of the projection, at least its rounding error
     whole = _power(error)
     rest = np.maximum(whole - size**2 * power, ROUNDING * whole) / HANN / (m - 1)
-    return size, np.sqrt(fdtri(2, 2 * (m - 1), 1 - level) * rest * HANN / power)
+    # Quantile of the F distribution with 2 and 2 (m - 1) degrees of freedom
+    ratio = (m - 1) * (level ** (-1 / (m - 1)) - 1)
+    return size, np.sqrt(ratio * rest * HANN / power)
 
 
 def _power(rows: Complex) -> Array:

@@ -4,7 +4,6 @@
 from collections.abc import Iterator
 
 import numpy as np
-from scipy.ndimage import uniform_filter1d
 
 from smp_motor_control.arrays import Array, Flags
 from smp_motor_ident.errors import SignalError
@@ -79,7 +78,8 @@ def _holds(rests: Flags, voltage: Array, speed: Array) -> bool:
 
     Behind a clipped sensor the current varies, and the voltage does not fit.
     """
-    smooth = uniform_filter1d(np.nan_to_num(speed), SMOOTH)
+    padded = np.pad(np.nan_to_num(speed), SMOOTH // 2, mode="edge")
+    smooth = np.convolve(padded, np.full(SMOOTH, 1 / SMOOTH), mode="valid")
     v, w = voltage[rests], smooth[rests]
     v, w = v - v.mean(), w - w.mean()
     both = float(v @ w)

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.fft import irfft, next_fast_len, rfft
+from numpy.fft import irfft, rfft
 
 from smp_motor_control.arrays import Array
 from smp_motor_ident.errors import SignalError
@@ -110,7 +110,7 @@ def _chance(v: Array, y: Array) -> float:
 
     It is the sum of the product of their autocorrelations over n.
     """
-    size = next_fast_len(2 * len(v), real=True)
+    size = 1 << (2 * len(v)).bit_length()
     own = [irfft(np.abs(rfft(x, size)) ** 2, size)[: len(v)] for x in (v, y)]
     if own[0][0] == 0 or own[1][0] == 0:
         return 1.0

@@ -6,7 +6,6 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from scipy.optimize import minimize
 
 from smp_motor_control.arrays import Array, Flags
 from smp_motor_ident._compile import compiled
@@ -142,6 +141,8 @@ def _answer(record: Record, speed: Array, known: Flags) -> Array:
     start: Array = min(tried, key=lambda motor: run(motor)[1])
     corners = start + np.vstack([np.zeros(3), np.diag([0.3, 0.5, 0.05])])
     options = {"initial_simplex": corners, "maxfev": 200, "xatol": 1e-3, "fatol": 0.0}
+    from scipy.optimize import minimize  # takes a while to load
+
     descend: Any = minimize  # its stubs know no initial simplex
     found = descend(lambda motor: run(motor)[1], start, method="Nelder-Mead", options=options)
     return run(found.x)[0]

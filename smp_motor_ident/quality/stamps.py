@@ -13,7 +13,7 @@ from itertools import pairwise
 from typing import Any
 
 import numpy as np
-from scipy.ndimage import minimum_filter1d
+from numpy.lib.stride_tricks import sliding_window_view
 
 from smp_motor_control.arrays import Array, Integers
 from smp_motor_ident._compile import compiled
@@ -122,7 +122,8 @@ def _lost(since: Array, number: Array, window: int) -> Array:
     if period <= 0:
         return lost
     rest = since - period * number
-    floor = minimum_filter1d(rest, window, origin=-(window // 2), mode="nearest")
+    padded = np.pad(rest, (0, window - 1), mode="edge")
+    floor = sliding_window_view(padded, window).min(axis=1)
     risen = np.flatnonzero(floor[window:] - floor[:-window] > 0.75 * period) + window
     at = 0
     for k in risen.tolist():
@@ -140,8 +141,9 @@ def _line(number: Array, value: Array) -> tuple[float, float]:
     """
     n = number.size
     hull = np.empty(n, dtype=np.int64)
-    size = 0
+    size, middle = 0, 0.0
     for k in range(n):
+        middle += number[k] / n
         while size > 1:
             i, j = hull[size - 2], hull[size - 1]
             run, rise = number[j] - number[i], value[j] - value[i]
@@ -150,7 +152,6 @@ def _line(number: Array, value: Array) -> tuple[float, float]:
             size -= 1
         hull[size] = k
         size += 1
-    middle = number.sum() / n
     edge = 0
     while edge < size - 2 and number[hull[edge + 1]] < middle:
         edge += 1
