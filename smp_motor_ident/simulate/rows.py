@@ -9,6 +9,7 @@ from functools import cached_property
 import numpy as np
 
 from smp_motor_control.arrays import Array, Integers
+from smp_motor_ident._compile import compiled
 
 MOST_KEPT = 4  # ways of cutting that are kept
 MOST_GROUPS = 48  # lengths of pieces whose transitions are tabulated
@@ -112,36 +113,45 @@ class Rows:
 
     def _cut(self, delay: float) -> tuple[Integers, Array, Integers, Integers]:
         """Return section, length and edges of every piece, and the pieces of every row."""
-        n, seg = len(self), self.segment
-        # One axis for all segments: each begins beyond the one before by more than any delay.
-        gap: Array = np.zeros(seg.size - 1)
-        gap[1:] = self.time[seg[1:-1] - 1] - self.time[seg[1:-1]] + 4 * abs(delay) + 1.0
-        gap = np.cumsum(gap)
-        axis = self.time + np.repeat(gap, np.diff(seg))
-        switch = np.delete(np.arange(self.begin.size), self.section[:-1])
-        instant = (self.begin + np.repeat(gap, np.diff(self.section)))[switch] + delay
-        begin = axis - self.interval
-        # Switches before each row's interval, and within [begin, row).
-        at = np.searchsorted(instant, begin, side="left")
-        until = np.searchsorted(instant, axis, side="left")
-        known = self.section[:-1] - np.arange(seg.size - 1)  # switches of earlier segments
-        known = np.repeat(known, np.diff(seg))
-        at, until = np.maximum(at, known), np.maximum(until, known)
-        until[seg[:-1]] = at[seg[:-1]]
-        inside = until - at
-        count = inside + 1
-        row = np.repeat(np.arange(n), count)
-        nth = np.arange(row.size) - np.repeat(np.cumsum(count) - count, count)
-        which = at[row] + nth  # switch at which the piece ends, unless it is the row's last
-        last = nth == inside[row]
-        at_switch = instant[np.minimum(which, instant.size - 1)] if instant.size else axis[row]
-        ends = np.where(last, axis[row], at_switch)
-        begins = np.where(nth == 0, begin[row], np.concatenate([[0.0], ends[:-1]]))
-        first = np.repeat(self.section[:-1], np.diff(seg))[row]
-        before = switch[np.maximum(which - 1, 0)] if switch.size else first
-        section = np.where(which > known[row], before, first)
-        edges = np.where(last, 0, 1) - np.where(nth == 0, 0, 1)
-        return section, np.maximum(ends - begins, 0.0), edges.astype(np.int64), count
+        most = len(self) + self.begin.size
+        section, length = np.empty(most, dtype=np.int64), np.empty(most)
+        edges, count = np.empty(most, dtype=np.int64), np.empty(len(self), dtype=np.int64)
+        pieces = _cut_rows(
+            self.time, self.interval, self.segment, self.begin, self.section, delay, section,
+            length, edges, count,
+        )  # fmt: skip
+        return section[:pieces], length[:pieces], edges[:pieces], count
+
+
+@compiled
+def _cut_rows(
+    time: Array, interval: Array, segment: Integers, begin: Array, first_section: Integers,
+    delay: float, section: Integers, length: Array, edges: Integers, count: Integers,
+) -> int:  # fmt: skip
+    """Fill in section, length and edges of every piece, and the pieces of every row."""
+    made = 0
+    for g in range(segment.shape[0] - 1):
+        at = first_section[g]  # of the command that acts
+        for row in range(segment[g], segment[g + 1]):
+            gone = time[row] - interval[row]
+            slack = SAME * interval[row]  # a switch at a row belongs to the next
+            while at + 1 < first_section[g + 1] and begin[at + 1] + delay < gone - slack:
+                at += 1
+            before = made
+            while (
+                row > segment[g]
+                and at + 1 < first_section[g + 1]
+                and begin[at + 1] + delay < time[row] - slack
+            ):
+                switch = begin[at + 1] + delay
+                section[made], length[made] = at, max(switch - gone, 0.0)
+                edges[made] = 1 if made == before else 0
+                gone, at, made = switch, at + 1, made + 1
+            section[made], length[made] = at, max(time[row] - gone, 0.0)
+            edges[made] = 0 if made == before else -1
+            made += 1
+            count[row] = made - before
+    return made
 
 
 def _groups(length: Array, edges: Integers, step: float) -> tuple[Integers, Array, Integers]:
