@@ -35,7 +35,7 @@ from known_motors import ROOT, TABLE_1, recording, table  # noqa: E402
 from smp_motor_control.motor.parameters import MotorParameters  # noqa: E402
 from smp_motor_ident.estimate import estimate  # noqa: E402
 from smp_motor_ident.fit.data import SEARCH_ROWS, prepare  # noqa: E402
-from smp_motor_ident.fit.descend import refit  # noqa: E402
+from smp_motor_ident.fit.descend import fit, restate  # noqa: E402
 from smp_motor_ident.fit.search import search  # noqa: E402
 from smp_motor_ident.record import Record  # noqa: E402
 
@@ -69,7 +69,7 @@ def one_fit(record: Record, friction: bool) -> Callable[[], np.ndarray]:
     found = search(data.thinned(SEARCH_ROWS))
 
     def call() -> np.ndarray:
-        values = refit(data, found).chain.values
+        values = fit(data, restate(data, found)).chain.values
         names = ("ln_a0", "ln_a1", "ln_a2", *(("vc",) if friction else ()))
         return np.array([values[n] for n in names])
 

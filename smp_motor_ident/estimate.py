@@ -11,7 +11,7 @@ from smp_motor_ident.errors import CurrentError, SmpError
 from smp_motor_ident.finding import Finding
 from smp_motor_ident.fit.adequacy import scatters
 from smp_motor_ident.fit.data import SEARCH_ROWS, Data, prepare
-from smp_motor_ident.fit.descend import Fit, constrain, fit, refine, refit
+from smp_motor_ident.fit.descend import Fit, constrain, fit, refine, restate
 from smp_motor_ident.fit.search import prune, search
 from smp_motor_ident.infer.answer import answer
 from smp_motor_ident.infer.findings import Judged, findings_of, refuse
@@ -129,10 +129,7 @@ def _best_fit(data: Data, request: Request) -> Fit:
     thin = data.thinned(SEARCH_ROWS)
     found = search(thin, request.policy, request.say)
     request.say(f"fitting {' + '.join(found.chain.codes)}")
-    if thin is data:
-        found = fit(data, found.chain, found.scales, found.initial, found.noise)
-    else:
-        found = refit(data, found)
+    found = fit(data, found if thin is data else restate(data, found))
     found = prune(data, refine(data, found))
     return constrain(data, found, request.constraints) if request.constraints else found
 

@@ -1,61 +1,44 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Weighted least squares of a chain on data, from given values.
+"""Weighted least squares of a chain on data, from given values: Levenberg-Marquardt.
 
-Levenberg-Marquardt on residuals whitened by the noise of every output; derivatives are differences
-between lanes of one simulation.  The initial state of every segment is eliminated.
-Derivation: docs/derivations.md, sections 5 and 6.
+Derivatives are kept while steps gain what they promise, so that most steps simulate one motor.
+Derivation: docs/derivations.md, section 6.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 
-from smp_motor_control.arrays import Array, Integers
-from smp_motor_ident.chain.chain import Chain, Constraint, respond
+from smp_motor_control.arrays import Array
+from smp_motor_ident.chain.chain import Chain, Constraint
 from smp_motor_ident.chain.component import Scales
-from smp_motor_ident.chain.quantities import jacobian
 from smp_motor_ident.fit.data import Data
+from smp_motor_ident.fit.linear import (
+    Linear,
+    follow,
+    invert,
+    linearise,
+    prior_rows,
+    residual,
+    settled,
+    whiten,
+)
 from smp_motor_ident.fit.noise import MAX_ORDER, Noise, fit_noise
 
 FARTHEST = 1.5  # e-folds that a logarithm moves in one step
 MAX_STEPS = 30
 CONVERGED = 1e-2  # of the deviance: a tenth of a standard deviation
 MOST_DAMPING = 100.0
-PRIOR_STATE = 2.0  # of q and speed at the beginning of a segment, in the largest of the recording
-
-
-@dataclass(frozen=True, eq=False)
-class Linear:
-    """Residuals and derivatives of a chain at its values, whitened; segments' states eliminated.
-
-    The last ``priors`` rows are of the motor's prior.
-    """
-
-    residual: Array  # shape (m + priors,)
-    columns: Array  # shape (m + priors, p)
-    row: Integers  # shape (m,): row of the record
-    output: Integers  # shape (m,): place of the output
-    priors: int
-    local_step: Array  # shape (segments, 3): of the initial states at a step of zero
-    local_gain: Array  # shape (segments, 3, p): its decrease per parameter step
-    simulated: tuple[Array, ...]  # every output, shape (n,)
-    local: Array  # shape (3, m): derivatives by the initial states
-    inverse: Array  # shape (segments, 3, 3): of their normal matrix, with their prior
-
-    @cached_property
-    def cost(self) -> float:
-        """Sum of squares."""
-        return float(self.residual @ self.residual)
-
-    @cached_property
-    def normal(self) -> Array:
-        """Normal matrix, shape (p, p)."""
-        return np.asarray(self.columns.T @ self.columns)
+NEAR = 0.03  # share of the cost that a step may promise where derivatives are kept
+NEAR_FOLD = 0.2  # step of a logarithm up to which they are
+KEPT = 0.5  # share of its promise that the gain of a step may be off where they are kept
+ROUGHNESS = 3.0  # times what is converged that events and rounding make the cost uneven
+FRESH = 0.1  # e-folds from where derivatives were taken up to which they serve at the end
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,7 +55,7 @@ class Fit:
     @cached_property
     def priors(self) -> tuple[str, ...]:
         """Causes of the last rows of ``linear``."""
-        return _prior(self.chain, self.scales)[2]
+        return prior_rows(self.chain, self.scales)[2]
 
     @property
     def motion(self) -> Array:
@@ -89,223 +72,86 @@ class Fit:
         """Covariance of the estimated parameters under their noise model, shape (p, p)."""
         return invert(self.linear.normal)
 
+    def under(self, data: Data, noise: Sequence[Noise]) -> Fit:
+        """Return the fit at the same values under another noise model."""
+        old = self.linear
+        linear = whiten(
+            data, self.chain, self.scales, self.initial, noise, old.simulated, old.derivatives,
+            old.exact,
+        )  # fmt: skip
+        return replace(
+            self, noise=tuple(noise), linear=linear, deviance=_deviance(data, linear, noise)
+        )
 
-def invert(normal: Array) -> Array:
-    """Return the inverse of a normal matrix; without information the variance is very large."""
-    scale = np.sqrt(np.maximum(np.diag(normal), 1e-300))
-    values, vectors = np.linalg.eigh(normal / np.outer(scale, scale))
-    inverse = (vectors / np.maximum(values, 1e-13)) @ vectors.T
-    return np.asarray(inverse / np.outer(scale, scale))
+    def descended(self, data: Data, converged: float = CONVERGED, most: int = MAX_STEPS) -> Fit:
+        """Return the fit at the nearest minimum, see `descend`."""
+        return descend(
+            data, self.chain, self.scales, self.initial, self.noise, most, converged, self.linear
+        )
 
-
-def linearise(
-    data: Data, chain: Chain, scales: Scales, initial: Array, noise: Sequence[Noise]
-) -> Linear:
-    """Return whitened residuals and derivatives of a chain."""
-    free = chain.free
-    p = len(free)
-    # The base, each parameter, then q and w of the segments unless all begin at rest.
-    states = 0 if data.stood.all() else 2
-    count = p + 1 + states
-    values = {q.name: np.full(count, chain.values[q.name]) for q in chain.parameters}
-    difference = np.empty(p + 2)
-    for j, parameter in enumerate(free):
-        d = parameter.difference(scales)
-        if chain.values[parameter.name] + d > parameter.bounds(scales)[1]:
-            d = -d
-        if parameter.name == "delay":
-            d = abs(d)
-        difference[j] = d
-        values[parameter.name][j + 1] += d
-    own = np.zeros((4, count))
-    difference[p:] = 1e-6 * scales.volts, 1e-6 * scales.speed
-    for j in range(states):
-        own[j, p + 1 + j] = difference[p + j]
-    outputs = _outputs(chain, values, data, scales, initial, own)
-    parts = []
-    for k, (measured, predicted) in enumerate(zip(data.outputs, outputs, strict=True)):
-        known = data.known[k]
-        lines = np.zeros((p + 4, known.size))
-        lines[0] = measured[known] - predicted[0, known]
-        np.subtract(predicted[1:, known], predicted[0, known], out=lines[1:count])
-        lines[1:count] /= difference[: count - 1, None]
-        lines[p + 3] = 1.0 if data.is_angle and k == 0 else 0.0
-        parts.append(noise[k].whiten(lines, _runs(data, k, noise[k])))
-    residuals, rows, _ = _prior(chain, scales)
-    priors = np.zeros((p + 4, residuals.size))
-    priors[0], priors[1 : p + 1] = residuals, rows.T
-    simulated = tuple(predicted[0].copy() for predicted in outputs)
-    return _eliminate(data, parts, priors, scales, initial, simulated)
-
-
-def _outputs(
-    chain: Chain, values: Mapping[str, Array], data: Data, scales: Scales, initial: Array,
-    own: Array | None = None,
-) -> list[Array]:  # fmt: skip
-    """Return every output of a chain, shape (lanes, n)."""
-    got = respond(chain, values, data.rows, scales, initial, own)
-    return [got.motion.T] if got.current is None else [got.motion.T, got.current.T]
-
-
-def _runs(data: Data, k: int, noise: Noise) -> Integers:
-    return data.whole_runs[k] if noise.over_gaps else data.runs[k]
-
-
-def residual(data: Data, chain: Chain, like: Fit) -> Array | None:
-    """Return the whitened residual of a chain under the noise of a fit, None if not finite.
-
-    Initial states are fitted by the derivatives of that fit.  Shape (m,).
-    """
-    values = {p.name: np.array([chain.values[p.name]]) for p in chain.parameters}
-    outputs = _outputs(chain, values, data, like.scales, like.initial)
-    parts = []
-    for k, (measured, predicted) in enumerate(zip(data.outputs, outputs, strict=True)):
-        known = data.known[k]
-        rest = (measured[known] - predicted[0, known])[None]
-        parts.append(like.noise[k].whiten(rest, _runs(data, k, like.noise[k]))[0])
-    r: Array = np.concatenate(parts)
-    if not np.isfinite(r).all():
-        return None
-    if np.isfinite(data.huber):
-        r *= _weight(r, data.huber)
-    linear = like.linear
-    pull = _pull(like.scales, like.initial)
-    for k, ends in enumerate(data.bounds):
-        right = -pull[k]
-        for first, last in ends:
-            right = right + linear.local[:, first:last] @ r[first:last]
-        solved = linear.inverse[k] @ right
-        for first, last in ends:
-            r[first:last] -= solved @ linear.local[:, first:last]
-    return r
-
-
-def _weight(residual: Array, huber: float) -> Array:
-    """Return the square root of the weights of a robust loss."""
-    return np.asarray(np.sqrt(np.minimum(1.0, huber / np.maximum(np.abs(residual), 1e-300))))
-
-
-def _state_prior(scales: Scales) -> Array:
-    """Return the weights of the priors of q, speed and angle at the beginning of a segment."""
-    sizes = PRIOR_STATE * np.array([scales.volts, scales.speed, np.inf])
-    return np.asarray(sizes**-2.0)
-
-
-def _pull(scales: Scales, initial: Array) -> Array:
-    """Return the gradient of the priors of the initial states, shape (segments, 3)."""
-    return np.asarray(_state_prior(scales) * initial[:, :3])
-
-
-def _prior(chain: Chain, scales: Scales) -> tuple[Array, Array, tuple[str, ...]]:
-    """Return residuals, rows and names of the components' priors."""
-    names = [p.name for p in chain.free]
-    residuals, rows, causes = [], [], []
-    for component in chain.components:
-        for weights, mean, deviation in component.expected(scales):
-            if any(n in names for n in weights):
-                at = sum(w * chain.values[n] for n, w in weights.items())
-                residuals.append((mean - at) / deviation)
-                rows.append([weights.get(n, 0.0) / deviation for n in names])
-                causes.append(next(iter(weights)))
-    for constraint in chain.constraints:
-        row, off, size = _constrained(chain, constraint)
-        if size > 0:
-            residuals.append(off / size)
-            rows.append(list(row / size))
-            causes.append(constraint.quantity)
-    # A parameter without effect gets a standard deviation of ten times its size, and stays.
-    for j, p in enumerate(chain.free):
-        residuals.append(0.0)
-        causes.append(p.name)
-        rows.append([0.0] * len(names))
-        rows[-1][j] = 0.1 / (max(p.typical, 1.0) * scales.of(p.unit))
-    made = np.array(rows).reshape(len(rows), len(names))
-    return np.array(residuals), made, tuple(causes)
-
-
-def _constrained(chain: Chain, constraint: Constraint) -> tuple[Array, float, float]:
-    """Return gradient, distance and deviation of a constraint; 0 for one that does not bind."""
-    values, rows = jacobian(chain)
-    if constraint.quantity not in values:
-        return np.zeros(0), 0.0, 0.0
-    at = values[constraint.quantity]
-    to = min(max(at, constraint.low), constraint.high)
-    if to == at and constraint.low < constraint.high:
-        return np.zeros(0), 0.0, 0.0
-    row = rows[list(values).index(constraint.quantity)]
-    return row, to - at, constraint.deviation * max(abs(to), 1e-12)
-
-
-def _eliminate(
-    data: Data, parts: Sequence[Array], priors: Array, scales: Scales, initial: Array,
-    simulated: tuple[Array, ...],
-) -> Linear:  # fmt: skip
-    """Project the initial states of all segments out of residual and columns."""
-    whole = np.concatenate([*parts, priors], axis=1)
-    m, p = data.row.size, whole.shape[0] - 4
-    if np.isfinite(data.huber):
-        whole[:, :m] *= _weight(whole[0, :m], data.huber)
-    g = data.rows.segment.size - 1
-    solved, inverse = np.zeros((g, 3, p + 1)), np.zeros((g, 3, 3))
-    pull = _pull(scales, initial)
-    prior = np.diag(_state_prior(scales))
-    for k, ends in enumerate(data.bounds):
-        inner = np.zeros((3, p + 4))
-        for first, last in ends:
-            inner += whole[p + 1 :, first:last] @ whole[:, first:last].T
-        inner[:, 0] -= pull[k]
-        free = slice(2, 3) if data.stood[k] else slice(0, 3)
-        small = (inner[:, p + 1 :] + prior)[free, free]
-        size = np.diag(small)
-        scale = np.sqrt(np.where(size > 0, size, 1.0))
-        small = small / np.outer(scale, scale) + 1e-12 * np.eye(scale.size)
-        inverse[k, free, free] = np.linalg.inv(small) / np.outer(scale, scale)
-        solved[k] = inverse[k] @ inner[:, : p + 1]
-        for first, last in ends:
-            whole[: p + 1, first:last] -= solved[k].T @ whole[p + 1 :, first:last]
-    return Linear(
-        whole[0], whole[1 : p + 1].T, data.row, data.output, priors.shape[1], solved[:, :, 0],
-        solved[:, :, 1:], simulated, whole[p + 1 :, :m], inverse,
-    )  # fmt: skip
+    def residual(self, data: Data, chain: Chain) -> Array | None:
+        """Return the whitened residual of another chain, None if not finite; shape (m,)."""
+        return residual(data, chain, self.scales, self.initial, self.noise, self.linear)
 
 
 def descend(
     data: Data, chain: Chain, scales: Scales, initial: Array, noise: Sequence[Noise],
-    most: int = MAX_STEPS, converged: float = CONVERGED,
+    most: int = MAX_STEPS, converged: float = CONVERGED, linear: Linear | None = None,
 ) -> Fit:  # fmt: skip
     """Return the chain at the nearest minimum of the whitened sum of squares.
 
-    It ends where a step changes the deviance by no more than ``converged``.
+    It ends where a step changes the deviance by no more than ``converged``.  ``linear``: residuals
+    at these values, and derivatives from values nearby.
     """
     at, start = chain, initial.copy()
-    linear = linearise(data, at, scales, start, noise)
+    if linear is None:
+        linear = linearise(data, at, scales, start, noise)
+    moved = 0.0  # e-folds since derivatives were taken
+    smooth = not (chain.constraints or np.isfinite(data.huber))
     damping = 1e-4
-    for _ in range(most):
-        if not at.free:
-            start = _settle_states(start, linear, np.zeros(0))
-            linear = linearise(data, at, scales, start, noise)
-            break
+    if not at.free:
+        start = settled(start, linear, np.zeros(0))
+        linear = linearise(data, at, scales, start, noise)
+    for _ in range(most if at.free else 0):
         step = _step(linear, at, scales, damping)
         if not np.isfinite(step).all():
             break
         values = _apply_step(at, scales, step)
         taken = np.array([values[p.name] - at.values[p.name] for p in at.free])
-        expected = float(taken @ (2 * linear.columns.T @ linear.residual - linear.normal @ taken))
+        expected = float(taken @ (2 * linear.gradient - linear.normal @ taken))
         trial = at.with_values(values)
-        trial_start = _settle_states(start, linear, taken)
-        following = linearise(data, trial, scales, trial_start, noise)
+        place = data, trial, scales, settled(start, linear, taken), noise
+        fold = _longest_fold(at, taken)
+        near = smooth and expected < NEAR * linear.cost and fold < NEAR_FOLD
+        following = follow(*place, linear) if near else linearise(*place)
+        if near and not _is_lower(following, linear):
+            following = linearise(*place)
         gained = linear.cost - following.cost
         least = converged * min(linear.cost / linear.row.size, 1.0)
-        if np.isfinite(following.cost) and gained >= -1e-9 * linear.cost:
-            at, start, linear = trial, trial_start, following
+        if _is_lower(following, linear):
+            at, start, linear = trial, place[3], following
+            moved = 0.0 if linear.exact else moved + fold
             damping = max(damping / 10, 1e-12)
             if expected < least and gained < least:
                 break
-        else:
+            if linear.exact or abs(gained - expected) < KEPT * expected:
+                continue
+        elif linear.exact:
             damping = max(damping * 10, 1e-2)
-            if damping > MOST_DAMPING or expected < least:
+            if damping > MOST_DAMPING or expected < ROUGHNESS * least:
                 break
+            continue
+        elif expected < least:
+            break
+        linear, moved = linearise(data, at, scales, start, noise), 0.0
+    if moved > FRESH:
+        linear = linearise(data, at, scales, start, noise)
     return Fit(at, scales, start, tuple(noise), linear, _deviance(data, linear, noise))
+
+
+def _is_lower(one: Linear, other: Linear) -> bool:
+    """Tell whether a sum of squares is lower than another, or the same up to rounding."""
+    return one.cost <= (1 + 1e-9) * other.cost
 
 
 def _deviance(data: Data, linear: Linear, noise: Sequence[Noise]) -> float:
@@ -316,8 +162,7 @@ def _deviance(data: Data, linear: Linear, noise: Sequence[Noise]) -> float:
 
 def _step(linear: Linear, chain: Chain, scales: Scales, damping: float) -> Array:
     """Return the damped Gauss-Newton step; parameters pushed against a bound stay."""
-    gradient = linear.columns.T @ linear.residual
-    normal = linear.normal
+    gradient, normal = linear.gradient, linear.normal
     scale = np.sqrt(np.maximum(np.diag(normal), 1e-300))
     inside = np.ones(scale.size, dtype=np.bool_)
     step = np.zeros(scale.size)
@@ -338,9 +183,14 @@ def _step(linear: Linear, chain: Chain, scales: Scales, damping: float) -> Array
                 pushed = True
         if not pushed:
             break
-    logs = [abs(s) for s, p in zip(step, chain.free, strict=True) if p.unit == "ln"]
-    longest = max(logs, default=0.0)
+    longest = _longest_fold(chain, step)
     return step * (FARTHEST / longest) if longest > FARTHEST else step
+
+
+def _longest_fold(chain: Chain, step: Array) -> float:
+    """Return the longest step of a logarithm."""
+    every = zip(step, chain.free, strict=True)
+    return max((abs(float(s)) for s, p in every if p.unit == "ln"), default=0.0)
 
 
 def _apply_step(chain: Chain, scales: Scales, step: Array) -> dict[str, float]:
@@ -352,30 +202,28 @@ def _apply_step(chain: Chain, scales: Scales, step: Array) -> dict[str, float]:
     return out
 
 
-def _settle_states(initial: Array, linear: Linear, step: Array) -> Array:
-    out = initial.copy()
-    out[:, :3] += linear.local_step - linear.local_gain @ step
-    return out
+def approach(
+    data: Data, chain: Chain, scales: Scales, initial: Array, most: int = MAX_ORDER
+) -> Fit:
+    """Return the fit from values that are far off, under the noise of its residual.
+
+    A misfit tells no noise: it is white at first, or of the speed for an angle, which drifts.
+    """
+    noise = [Noise.white(float(np.nanstd(y)) or 1.0) for y in data.outputs]
+    if data.is_angle:
+        noise[0] = Noise.integrated(float(np.nanstd(data.speed)) * data.rows.step or 1.0)
+    found = descend(data, chain, scales, initial, noise, most=20, converged=1.0)
+    return found.under(data, fit_noises(data, found.linear, most))
 
 
 def fit(
-    data: Data, chain: Chain, scales: Scales, initial: Array, noise: Sequence[Noise] | None = None,
-    rounds: int = 6, most: int = MAX_ORDER, converged: float = CONVERGED,
-) -> Fit:  # fmt: skip
-    """Return the chain and the noise of every output that explain data best from given values."""
-    if noise is None:
-        # A misfit tells no noise: a drifting angle is fitted by its speed.
-        noise = [Noise.white(float(np.nanstd(y)) or 1.0) for y in data.outputs]
-        if data.is_angle:
-            noise[0] = Noise.integrated(float(np.nanstd(data.speed)) * data.rows.step or 1.0)
-        found = descend(data, chain, scales, initial, noise, most=20, converged=1.0)
-        chain, initial = found.chain, found.initial
-        noise = fit_noises(data, found.linear, most)
-    found = descend(data, chain, scales, initial, noise, most=8, converged=1.0)
+    data: Data, begun: Fit, rounds: int = 6, most: int = MAX_ORDER, converged: float = CONVERGED
+) -> Fit:
+    """Return the chain and the noise of every output that explain data best, from a fit."""
+    found = begun.descended(data, 1.0, 8)
     least = max(10 * converged, 1.0)
     for _ in range(rounds):
-        noise = fit_noises(data, found.linear, most)
-        other = descend(data, found.chain, scales, found.initial, noise, converged=converged)
+        other = found.under(data, fit_noises(data, found.linear, most)).descended(data, converged)
         gained = _information_criterion(data, found) - _information_criterion(data, other)
         if gained > 0:
             found = other
@@ -392,8 +240,8 @@ def refine(data: Data, found: Fit) -> Fit:
     if found.noise[0].order == 0:
         return found
     white = (Noise.white(float(np.nanstd(data.motion - found.motion))), *found.noise[1:])
-    begun = descend(data, found.chain, found.scales, found.initial, white)
-    other = fit(data, begun.chain, begun.scales, begun.initial, fit_noises(data, begun.linear))
+    begun = found.under(data, white).descended(data)
+    other = fit(data, begun.under(data, fit_noises(data, begun.linear)))
     return min(found, other, key=lambda f: _information_criterion(data, f))
 
 
@@ -411,28 +259,18 @@ def constrain(data: Data, found: Fit, constraints: Sequence[Constraint]) -> Fit:
         held = tuple(replace(c, deviation=deviation) for c in constraints)
         chain = replace(found.chain, constraints=held)
         found = descend(data, chain, found.scales, found.initial, found.noise)
-    return fit(data, found.chain, found.scales, found.initial, found.noise)
-
-
-def refit(data: Data, found: Fit) -> Fit:
-    """Return the fit to other rows of the recording of a fit, under the noise that they show."""
-    begun, noise = _restart(data, found)
-    return fit(data, found.chain, found.scales, begun.initial, noise)
+    return fit(data, found)
 
 
 def restate(data: Data, found: Fit) -> Fit:
     """Return a fit at the same values on other rows of its recording."""
-    begun, noise = _restart(data, found)
-    linear = linearise(data, found.chain, found.scales, begun.initial, noise)
-    return replace(found, initial=begun.initial, noise=tuple(noise), linear=linear)
-
-
-def _restart(data: Data, found: Fit) -> tuple[Fit, list[Noise]]:
-    """Return the initial states, and the noise, of other rows of the recording of a fit."""
-    still = replace(found.chain, fixed=frozenset(p.name for p in found.chain.parameters))
-    white = [Noise.white(float(np.nanstd(y)) or 1.0) for y in data.outputs]
-    begun = descend(data, still, found.scales, data.initial, white)
-    return begun, fit_noises(data, begun.linear)
+    chain, scales = found.chain, found.scales
+    white = tuple(Noise.white(float(np.nanstd(y)) or 1.0) for y in data.outputs)
+    linear = linearise(data, chain, scales, data.initial, white)
+    initial = settled(data.initial, linear, np.zeros(len(chain.free)))
+    linear = follow(data, chain, scales, initial, white, linear)
+    begun = replace(found, initial=initial, noise=white, linear=linear)
+    return begun.under(data, fit_noises(data, linear))
 
 
 def settle(data: Data, chain: Chain, scales: Scales) -> Array:
@@ -444,7 +282,7 @@ def settle(data: Data, chain: Chain, scales: Scales) -> Array:
     initial = data.initial
     for _ in range(4):
         linear = linearise(motion, fixed, scales, initial, noise)
-        initial = _settle_states(initial, linear, np.zeros(0))
+        initial = settled(initial, linear, np.zeros(0))
     return linearise(motion, fixed, scales, initial, noise).simulated[0]
 
 

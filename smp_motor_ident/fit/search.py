@@ -29,7 +29,8 @@ from smp_motor_ident.chain.sensor import Angle, DifferencedSpeed, Speed
 from smp_motor_ident.errors import CurrentError, InsufficientExcitationError
 from smp_motor_ident.fit.adequacy import scatters
 from smp_motor_ident.fit.data import Data
-from smp_motor_ident.fit.descend import Fit, Linear, descend, fit, fit_noises, residual
+from smp_motor_ident.fit.descend import Fit, approach, descend, fit, fit_noises
+from smp_motor_ident.fit.linear import Linear
 from smp_motor_ident.fit.start import guesses
 
 SEARCH_ORDER = 2
@@ -37,6 +38,8 @@ SEARCH_ORDER = 2
 RESOLVED = 1.1  # residual over the rounding of an encoder up to which it is rounding
 CLEARLY = 0.3  # gain by screening over that of another's fit, below which a component waits for it
 ROUGH = 0.3  # change of the deviance at which a fit of the search ends
+ADEQUATE = 2.0  # disagreement between parts of a record, up to which a chain explains it
+SAME = 1.0  # difference of the deviance up to which two fits are at one minimum
 CERTAIN = 20.0  # deviations from none at which a component is needed without a fit that says so
 NEEDED = ("friction", "asymmetric_friction")  # components that every motor has
 
@@ -54,7 +57,6 @@ class SelectionPolicy:
     given: Mapping[str, float] = field(default_factory=dict)  # by the names of `catalogue.GIVEN`
     most: int = 4  # largest number of optional components for exchanges
     extra: float = 6.0  # deviance: odds that an addition must have beyond even ones
-    doubtful: float = 2.0  # disagreement between parts of a record that asks for exchanges
     inadequate: float = 4.0  # disagreement between parts of a record that asks for another start
 
     def price(self, component: Component, information: float) -> float:
@@ -108,7 +110,7 @@ def _improve(found: Fit, data: Data, policy: SelectionPolicy, say: Say) -> Fit:
     for _ in range(policy.rounds):
         better = _best_addition(found, data, policy, say)
         few = len(list(_optional(found, data))) <= policy.most
-        if better is None and few and not exchanged and inadequacy(data, found) > policy.doubtful:
+        if better is None and few and not exchanged and inadequacy(data, found) > ADEQUATE:
             exchanged = True
             better = _best_exchange(found, data, policy, say)
         if better is None:
@@ -156,7 +158,7 @@ def screen(found: Fit, data: Data, policy: SelectionPolicy) -> list[Candidate]:
     base = found.linear.residual[:m]
     best: dict[str, Candidate] = {}
     for one, chain in candidates(found, data):
-        r = residual(data, chain, found)
+        r = found.residual(data, chain)
         if r is None:
             continue
         # What the other parameters take up of it, as far as their priors let them.
@@ -234,17 +236,18 @@ def _fit_simplest(data: Data, policy: SelectionPolicy) -> Fit:
 
 def _fit_starts(data: Data, chains: Sequence[Chain], policy: SelectionPolicy) -> list[Fit]:
     """Return the fits that begin at guesses, the best first."""
-    firsts = []
+    firsts: list[Fit] = []
     for chain in chains:
         scales = data.scales(math.exp(chain.values["ln_a1"] - chain.values["ln_a0"]))
         chain = chain.with_values({"vc": max(chain.values["vc"], 0.01 * scales.volts)})
         chain = chain.with_component(*plain_sensor(data))
         chain = with_given(chain, data, policy.given)
-        firsts.append(
-            fit(data, chain, scales, data.initial, rounds=2, most=SEARCH_ORDER, converged=ROUGH)
-        )
-    distinct = {round(f.deviance): f for f in firsts}.values()  # several end at one minimum
-    fits = distinct if policy.first_order else [_second_order(data, f) for f in distinct]
+        begun = approach(data, chain, scales, data.initial, SEARCH_ORDER)
+        if all(abs(begun.deviance - other.deviance) > SAME for other in firsts):
+            firsts.append(begun)
+    fits = [fit(data, first, 2, SEARCH_ORDER, ROUGH) for first in firsts]
+    if not policy.first_order:
+        fits = [_second_order(data, first) for first in fits]
     return sorted(fits, key=lambda f: f.deviance)
 
 
@@ -277,11 +280,7 @@ def _second_order(data: Data, first: Fit) -> Fit:
         ln_a2 = values["ln_a1"] + math.log(share * lag)
         chain = first.chain.with_component(MOTORS[1], {"ln_a2": ln_a2, "viscous": 0.1})
         begun.append(descend(data, chain, scales, first.initial, first.noise, most=4))
-    best = min(begun, key=lambda f: f.linear.cost)
-    return fit(
-        data, best.chain, scales, best.initial, best.noise, rounds=1, most=SEARCH_ORDER,
-        converged=ROUGH,
-    )  # fmt: skip
+    return fit(data, min(begun, key=lambda f: f.linear.cost), 1, SEARCH_ORDER, ROUGH)
 
 
 def _with_current(data: Data, found: Fit) -> Fit:
@@ -306,9 +305,8 @@ def _with_current(data: Data, found: Fit) -> Fit:
                 best = rest, chain.with_values(at)
     if best is None:
         raise CurrentError("the current does not follow from voltage and motion")
-    return fit(
-        data, best[1], found.scales, found.initial, rounds=2, most=SEARCH_ORDER, converged=ROUGH
-    )
+    begun = approach(data, best[1], found.scales, found.initial, SEARCH_ORDER)
+    return fit(data, begun, 2, SEARCH_ORDER, ROUGH)
 
 
 def fit_roughly(data: Data, chain: Chain, like: Fit) -> Fit:
@@ -319,7 +317,7 @@ def fit_roughly(data: Data, chain: Chain, like: Fit) -> Fit:
 def _refit_noise(data: Data, found: Fit) -> Fit:
     """Return the fit under the noise of its own residual."""
     noise = fit_noises(data, found.linear, SEARCH_ORDER)
-    return descend(data, found.chain, found.scales, found.initial, noise, most=8, converged=ROUGH)
+    return found.under(data, noise).descended(data, ROUGH, 8)
 
 
 def _best_addition(found: Fit, data: Data, policy: SelectionPolicy, say: Say) -> Fit | None:
@@ -427,7 +425,7 @@ def prune(data: Data, found: Fit) -> Fit:
         plainer = next((c for one, c in every if _is_negligible(data, found, one, c)), None)
         if plainer is None:
             return found
-        found = fit(data, plainer, found.scales, found.initial, found.noise)
+        found = fit(data, fit_roughly(data, plainer, found))
 
 
 def _is_negligible(data: Data, found: Fit, one: Component, plainer: Chain) -> bool:

@@ -16,7 +16,7 @@ from smp_motor_ident.errors import CurrentError, InsufficientExcitationError, Si
 from smp_motor_ident.finding import Finding
 from smp_motor_ident.fit.adequacy import Scatter
 from smp_motor_ident.fit.data import Data, prepare
-from smp_motor_ident.fit.descend import Fit, fit
+from smp_motor_ident.fit.descend import Fit, approach, fit
 from smp_motor_ident.fit.start import guesses
 from smp_motor_ident.infer.answer import BY_CURRENT, Answer
 from smp_motor_ident.infer.levels import Levels
@@ -123,7 +123,7 @@ def _refuse_angle(where: str, group: Sequence[Record]) -> None:
     angles = [replace(r, velocity=None, position=r.velocity) for r in group]
     data = prepare(angles, use_current=False)
     for chain in guesses(data, 1):
-        found = fit(data, chain, data.scales(1.0), data.initial, rounds=1)
+        found = fit(data, approach(data, chain, data.scales(1.0), data.initial), rounds=1)
         if explained(data, found.motion) > limits.FIT_EXPLAINS.value:
             raise SignalError(
                 f"{where}: the speed follows the voltage as an angle does; map it as position"

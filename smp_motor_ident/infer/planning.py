@@ -19,7 +19,7 @@ from smp_motor_ident.chain.quantities import jacobian
 from smp_motor_ident.chain.sensor import Angle, Current
 from smp_motor_ident.errors import ParameterError
 from smp_motor_ident.fit.data import Data, prepare
-from smp_motor_ident.fit.descend import invert, linearise
+from smp_motor_ident.fit.linear import invert, linearise
 from smp_motor_ident.fit.noise import Noise
 from smp_motor_ident.record import Hardware, Record
 from smp_motor_ident.result import Estimate

@@ -20,7 +20,10 @@ def test_a_driver_that_ignores_small_commands_is_named_and_leaves_the_motor_righ
     found = estimate(replace(made, voltage=command))
     assert "hard_dead_zone" in [f.code for f in found.findings]
     # No command lies in between, so the data tell no more.
-    assert 1.2 < found.value("least_command") < 1.8
+    least = found.combinations["least_command"]
+    assert 1.2 < least.value < 1.8
+    assert 0.05 < least.total_std < 0.6
+    assert least.total_ci95[0] < LEAST < least.total_ci95[1]
     truth = motors.truth("rear_left", 0.3)
     for name in ("dc_gain", "time_constant", "static_voltage"):
         assert found.value(name) == pytest.approx(truth[name], rel=2e-3)
