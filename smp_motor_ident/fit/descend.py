@@ -106,26 +106,21 @@ def descend(
     at, start = chain, initial.copy()
     if linear is None:
         linear = linearise(data, at, scales, start, noise)
-    moved = 0.0  # e-folds since derivatives were taken
-    smooth = not (chain.constraints or np.isfinite(data.huber))
-    damping = 1e-4
     if not at.free:
         start = settled(start, linear, np.zeros(0))
         linear = linearise(data, at, scales, start, noise)
+    moved, damping = 0.0, 1e-4  # e-folds since derivatives were taken
     for _ in range(most if at.free else 0):
         step = _step(linear, at, scales, damping)
         if not np.isfinite(step).all():
             break
-        values = _apply_step(at, scales, step)
-        taken = np.array([values[p.name] - at.values[p.name] for p in at.free])
+        trial = at.with_values(_apply_step(at, scales, step))
+        taken = np.array([trial.values[p.name] - at.values[p.name] for p in at.free])
         expected = float(taken @ (2 * linear.gradient - linear.normal @ taken))
-        trial = at.with_values(values)
-        place = data, trial, scales, settled(start, linear, taken), noise
         fold = _longest_fold(at, taken)
-        near = smooth and expected < NEAR * linear.cost and fold < NEAR_FOLD
-        following = follow(*place, linear) if near else linearise(*place)
-        if near and not _is_lower(following, linear):
-            following = linearise(*place)
+        place = data, trial, scales, settled(start, linear, taken), noise
+        near = expected < NEAR * linear.cost and fold < NEAR_FOLD
+        following = _simulate_step(place, linear, near)
         gained = linear.cost - following.cost
         least = converged * min(linear.cost / linear.row.size, 1.0)
         if _is_lower(following, linear):
@@ -147,6 +142,18 @@ def descend(
     if moved > FRESH:
         linear = linearise(data, at, scales, start, noise)
     return Fit(at, scales, start, tuple(noise), linear, _deviance(data, linear, noise))
+
+
+def _simulate_step(
+    place: tuple[Data, Chain, Scales, Array, Sequence[Noise]], linear: Linear, near: bool
+) -> Linear:
+    """Return residuals after a step, with derivatives of their own where those kept do not do."""
+    data, chain = place[:2]
+    if near and not chain.constraints and not np.isfinite(data.huber):
+        following = follow(*place, linear)
+        if _is_lower(following, linear):
+            return following
+    return linearise(*place)
 
 
 def _is_lower(one: Linear, other: Linear) -> bool:
