@@ -144,5 +144,4 @@ class Protocol:
         """Yield the main results, one line per wheel."""
         rows = [row for group in self.results().values() for row in group if row.name in SUMMARY]
         for k, wheel in enumerate(self.document["wheels"]):
-            told = (f"{row.name} {row.cells[k]} {row.unit}" for row in rows)
-            yield f"{wheel}: {', '.join(told)}"
+            yield f"{wheel}: {'; '.join(row.tell(k) for row in rows)}"

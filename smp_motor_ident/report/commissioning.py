@@ -50,6 +50,13 @@ class Row:
     name: str
     unit: str
     cells: tuple[str, ...]  # by wheel, in the order of the wheels
+    systematic: tuple[str, ...] = ()  # uncertainty of each cell, or none at all
+
+    def tell(self, k: int) -> str:
+        """Return one wheel's quantity in a line."""
+        shares = self.systematic[k] if self.systematic else ""
+        text = f"{self.name} {self.cells[k]} {self.unit}"
+        return f"{text}, systematic {shares}" if shares else text
 
 
 Results = Mapping[str, Sequence[Row]]
@@ -75,27 +82,15 @@ def results(
 
 
 def _motor(estimates: Mapping[str, Estimate]) -> Iterator[Row]:
-    """Return every number that the records tell, with the digits that its scatter allows."""
+    """Return every number that the records tell, with random and systematic uncertainty."""
     held = [{**one.combinations, **one.parameters} for one in estimates.values()]
-    alike: dict[tuple[str, ...], list[str]] = {}  # names by their systematic uncertainties
     for name in dict.fromkeys(name for one in held for name in one):
         found = [one.get(name, Quantity(None)) for one in held]
-        if any(one.value is not None for one in found):
-            unit = next(words.scaled(one).unit for one in found if one.value is not None)
-            yield Row(words.label(name), words.typeset(unit), tuple(map(_stated, found)))
-        if any(one.systematic for one in found):
-            cells = tuple(words.systematic(one) for one in found)
-            alike.setdefault(cells, []).append(words.label(name).lower())
-    for cells, names in alike.items():
-        yield Row(f"Systematic, of {', '.join(names)}", "", cells)
-
-
-def _stated(quantity: Quantity) -> str:
-    shown = words.scaled(quantity)
-    value = words.number(shown.value, shown.std)
-    if quantity.value is None or quantity.status != "estimated":
-        return value
-    return f"{value} ± {words.spread(shown.std)}"
+        known = [one for one in found if one.value is not None]
+        if known:
+            unit = words.typeset(words.scaled(known[0]).unit)
+            values = tuple(words.state(one, with_unit=False) for one in found)
+            yield Row(words.label(name), unit, values, tuple(map(words.systematic, found)))
 
 
 def _drive(
@@ -106,8 +101,11 @@ def _drive(
         ("settling", "Settles", 1e3, "ms"),
         ("overshoot", "Overshoots", 1.0, "%"),
     ):
-        designed = (_figure(scale, e["specification"][name]["high"]) for e in entries)
-        yield Row(f"{title}, designed at most", unit, tuple(designed))
+        bands = [e["specification"][name] for e in entries]
+        designed = (
+            f"{_figure(scale, b['value'])}, at most {_figure(scale, b['high'])}" for b in bands
+        )
+        yield Row(f"{title}, designed", unit, tuple(designed))
         if name == "settling":
             planned = (_figure(scale, e["settling"]["transition"]) for e in entries)
             yield Row("Planned transition, included", unit, tuple(planned))
@@ -119,7 +117,7 @@ def _drive(
 
 
 def _figure(scale: float, value: float | None) -> str:
-    return "—" if value is None else f"{scale * value:.3g}"
+    return "—" if value is None else f"{round(scale * value, 2):.3g}"
 
 
 def charts(changes: Sequence[Change]) -> list[Chart]:

@@ -4,6 +4,7 @@
   const charts = JSON.parse(document.getElementById("charts").textContent);
   const color = name => getComputedStyle(document.documentElement).getPropertyValue(`--${name}`).trim();
   const plots = [];
+  let update = () => {};  // shows the chosen design in the charts of the tuning page
 
   const unpack = text => {
     const bytes = Uint8Array.from(atob(text), c => c.charCodeAt(0));
@@ -89,7 +90,7 @@
     const place = figure.querySelector(".live");
     const fold = figure.closest("details:not([open])");
     if (fold) {  // drawn when it is opened
-      fold.addEventListener("toggle", () => draw(chart), {once: true});
+      fold.addEventListener("toggle", () => { draw(chart); update(); }, {once: true});
       return;
     }
     place.hidden = false;
@@ -166,6 +167,7 @@
         part("copied").textContent = "marked: press Ctrl-C";
       }
     });
+    update = show;
     choose();
   }
 

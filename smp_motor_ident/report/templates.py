@@ -23,7 +23,11 @@ def page(name: str, charts: Sequence[Chart] | None = None, **content: Any) -> st
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    environment.filters |= {"label": words.label, "sentence": words.to_sentence}
+    environment.filters |= {
+        "label": words.label,
+        "sentence": words.to_sentence,
+        "shares": _keep_together,
+    }
     style = text("colors.css") + text("report.css")
     if charts is not None:
         style = text("uplot/uPlot.min.css") + style
@@ -35,6 +39,12 @@ def page(name: str, charts: Sequence[Chart] | None = None, **content: Any) -> st
             "script": Markup(text("plots.js")),
         }
     return environment.get_template(name).render(style=Markup(style), **content)
+
+
+def _keep_together(shares: str) -> Markup:
+    """Return a list whose lines break at its commas only."""
+    whole = Markup('<span class="share">{}</span>')
+    return Markup(", ").join(whole.format(one) for one in shares.split(", "))
 
 
 def text(name: str) -> str:

@@ -113,8 +113,12 @@ def spread(std: float | None) -> str:
     if std is None or not math.isfinite(std):
         return "—"
     if std == 0 or 1e-4 <= std < 1e3:
-        return f"{std:.2g}"
+        return _two_digits(std)
     return f"{std:.1e}"
+
+
+def _two_digits(value: float) -> str:
+    return f"{float(f'{value:.2g}'):g}"
 
 
 def state(quantity: Quantity, with_unit: bool = True) -> str:
@@ -171,7 +175,7 @@ def systematic(quantity: Quantity) -> str:
     words = []
     for one in shown.systematic:
         unit = _with_unit(spread(one.size), shown.unit)
-        size = f"{100 * one.share:.2g} %" if one.share is not None else unit
+        size = f"{_two_digits(100 * one.share)} %" if one.share is not None else unit
         words.append(f"± {size} ({cause(one.cause)})")
     volts = (quantity.valid or {}).get("voltage")
     return ", ".join([*words, *([f"seen at ±{volts[1]:.3g} V only"] if volts else [])])

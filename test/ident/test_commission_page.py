@@ -41,10 +41,11 @@ def change(wheel: str, name: str, setpoint: float) -> Change:
 def passed(tmp_path: Path) -> Path:
     """A folder with a commissioning that passed, of four wheels that drove both ways."""
     estimates = {wheel: estimate(wheel) for wheel in WHEELS}
-    scale = (Share("current_scale", 0.03, 0.39),)
-    first = estimates[WHEELS[0]]
-    held = {n: replace(first.parameters[n], systematic=scale) for n in ("resistance", "inductance")}
-    estimates[WHEELS[0]] = replace(first, parameters={**first.parameters, **held})
+    shares = (Share("current_scale", 0.03, 0.39), Share("smoothed_current", 0.0043, 0.06),
+              Share("low_passed_current", 0.0022, 0.03))  # fmt: skip
+    for wheel, one in estimates.items():
+        held = {n: replace(q, systematic=shares) for n, q in one.parameters.items()}
+        estimates[wheel] = replace(one, parameters=held)
     (tmp_path / "identification").mkdir()
     text = to_json(identification_document(estimates))
     (tmp_path / "identification" / "identification.json").write_text(text)
@@ -83,10 +84,13 @@ def test_page_opens_with_motors_and_gains_then_yaml_then_the_drive(passed, tmp_p
         # The numbers are those of the JSON, each with the scatter of the records.
         rows = {row.split("\t")[0]: row.split("\t")[1:] for row in shown(browser, "#results tr")}
         assert rows["p V s/rad"] == ["2.675"] * 4 and rows["i V/rad"] == ["87.97"] * 4
-        assert rows["DC gain rad/s/V"] == ["25.50 ± 0.1"] * 4
-        assert rows["Resistance Ω"] == ["12.92 ± 0.13"] * 4  # systematic errors stand apart
-        assert rows["Systematic, of resistance, inductance"][0] == "± 3 % (current scale)"
-        assert rows["Settles, designed at most ms"] == ["150"] * 4
+        assert rows["DC gain rad/s/V"] == ["25.50 ± 0.10"] * 4
+        # Systematic errors stand apart, all of them in the width of the page.
+        assert [" ".join(cell.split()) for cell in rows["Resistance Ω"]] == [
+            "12.92 ± 0.13 ± 3 % (current scale), ± 0.43 % (current smoothing), "
+            "± 0.22 % (current low-pass)"
+        ] * 4
+        assert rows["Settles, designed ms"] == ["145, at most 150"] * 4
         assert rows["Settles, driven ms"] == ["149"] * 4
         # The button copies the parameter file.
         (copied,) = shown(browser, "#gains pre")
@@ -99,7 +103,7 @@ def test_page_opens_with_motors_and_gains_then_yaml_then_the_drive(passed, tmp_p
         assert browser.complaints == []
 
 
-@pytest.mark.parametrize("width", [1280, 390])
+@pytest.mark.parametrize("width", [1280, 1000, 720, 390])
 def test_no_table_is_cut_and_the_page_does_not_scroll_sideways(passed, tmp_path, width):
     with Browser(tmp_path / "profile") as browser:
         browser.open(passed / "report.html", width)

@@ -182,7 +182,7 @@ def test_the_table_is_read_whole_on_a_screen_and_on_a_phone(tmp_path):
     file.write_text(page([row, replace(row, wheel="rear_left", failure="it stood still")], []))
     cells = "[...document.querySelectorAll('td')].map(c => c.getBoundingClientRect())"
     with Browser(tmp_path / "profile") as browser:
-        for width in (1280, 390):
+        for width in (1280, 1000, 720, 390):
             browser.open(file, width)
             assert browser.value("document.documentElement.scrollWidth") <= width
             assert browser.value(f"Math.max(...{cells}.map(c => c.right))") <= width

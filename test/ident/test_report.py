@@ -23,7 +23,7 @@ from smp_motor_ident.report.figures import Comparison, frequency_charts, residua
 from smp_motor_ident.report.html import Report, render
 from smp_motor_ident.report.summary import find_doubted
 from smp_motor_ident.report.tuning_page import tuning_charts
-from smp_motor_ident.result import Quantity, ResidualTests
+from smp_motor_ident.result import Quantity, ResidualTests, Share
 from smp_motor_ident.tune import Loop, design
 from smp_motor_ident.tune.curves import Curves
 
@@ -120,6 +120,16 @@ def test_a_number_has_the_digits_that_its_deviation_allows(quantity, number, bet
     assert words.interval(quantity) == between
 
 
+@pytest.mark.parametrize(
+    ("size", "share", "told"),
+    [(28.0, 1.874, "± 190 % (delay)"), (0.04, 0.0031, "± 0.31 % (delay)"),
+     (150.0, None, "± 150 V (delay)")],
+)  # fmt: skip
+def test_systematic_errors_are_told_with_two_digits_and_no_exponent(size, share, told):
+    quantity = Quantity(14.9, 3.5, unit="V", systematic=(Share("delay", share, size),))
+    assert words.systematic(quantity) == told
+
+
 def test_every_colour_of_the_charts_is_a_variable_of_the_page(page):
     charts = json.loads(re.findall(r'id="charts">(.*?)</script>', page, re.DOTALL)[0])
     used = set(re.findall(r"var\(--([a-z0-9-]+)\)", page))
@@ -205,6 +215,11 @@ def test_sliders_of_the_tuning_page_choose_designs_that_tune_has_made(tmp_path, 
         slider = "document.getElementById('tuning-bandwidth')"
         browser.value(f"{slider}.value = 0, {slider}.dispatchEvent(new Event('input'))")
         assert browser.value(yaml) == held["choices"][0]["yaml"]
+        # A chart that is unfolded later shows the design of the slider.
+        browser.value("document.querySelector('#tuning details').open = true")
+        frame = "new Promise(done => setTimeout(done))"
+        browser.ask("Runtime.evaluate", awaitPromise=True, expression=frame)
+        assert "ready" in browser.value("document.getElementById('figure-tuning-gain').className")
         assert browser.value("document.documentElement.scrollWidth") <= 390
         assert browser.complaints == []
         assert set(browser.requests) == {file.as_uri()}
