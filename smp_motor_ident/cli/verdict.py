@@ -18,6 +18,7 @@ MAX_SETTLING_EXCESS = 20.0  # ms later than predicted: four samples
 MAX_GAIN_ERROR = 0.5  # percent
 MAX_DEVIATIONS = 3.0  # of its own standard deviations, for every parameter of a wheel
 WORST_DEVIATIONS = 4.0
+UNIT = "standard deviations, timing included,"  # the one systematic error that a simulation has
 # Of 40 numbers, some 26 of them independent, one lies beyond 3 by chance in one run of 15
 # (and beyond 4 in one of 600): so one wheel may, and none may beyond 4.
 
@@ -61,7 +62,8 @@ def show(
         title = f"{words.label(wheel)}: {words.model(estimate.model)}"
         made = table(title, "", "true", "identified", "std", "error/std", "unit")
         made.columns[5].justify = "left"
-        for name, true, quantity in _compared(truth[wheel], estimate):
+        compared = _compared(truth[wheel], estimate)
+        for name, true, quantity in compared:
             std = quantity.std or 0.0
             error = (quantity.value or 0.0) - true
             made.add_row(
@@ -72,6 +74,7 @@ def show(
                 f"{error / std:+.1f}" if std else "",
                 quantity.unit,
             )
+        shares = (f"{n} {words.systematic(q)}" for n, _, q in compared if q.systematic)
         mine = designed.gains[wheel]
         text = ", ".join(f"{n} {mine[n]:.4g}" for n in GAINS if mine.get(n))
         columns = ("manoeuvre", "to", "settling", "predicted", "overshoot", "predicted")
@@ -82,6 +85,7 @@ def show(
             overshoot = (f"{x.overshoot:.2f} %" for x in pairs)
             driven.add_row(one.name, f"{one.setpoint:+.2f} rad/s", *settled, *overshoot)
         out.print(made)
+        out.print(f"systematic: {'; '.join(shares) or 'none'}", soft_wrap=True)
         out.print(f"gains (volts, wheel rad/s): {text}", soft_wrap=True)
         out.print(driven)
 
@@ -106,7 +110,7 @@ def check_estimates(
                     beyond.add(wheel)
     return [
         _worst("error of the DC gain", gain, MAX_GAIN_ERROR, "%"),
-        _worst("error of a parameter", deviation, WORST_DEVIATIONS, "standard deviations"),
+        _worst("error of a parameter", deviation, WORST_DEVIATIONS, UNIT),
         Check("wheels with an error beyond 3", len(beyond), 1, ", ".join(beyond) or "-", "wheels"),
     ]
 
