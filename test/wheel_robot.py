@@ -112,9 +112,9 @@ class Relay:
 
 
 class WheelRobot(DomainNode):
-    """Publish set-points while spinning and store the wheels' states."""
+    """Publish set-points while spinning and store the wheels' states, of a robot's namespace."""
 
-    def __init__(self, domain: int) -> None:
+    def __init__(self, domain: int, space: str = "") -> None:
         super().__init__(domain, "robot")
         self.states: dict[str, list[MotorState]] = {w: [] for w in (*WHEELS, "raw")}
         self.commands: dict[str, list[MotorCommand]] = {w: [] for w in WHEELS}
@@ -126,12 +126,12 @@ class WheelRobot(DomainNode):
         node = self.node
         for wheel in WHEELS:
             kept = self.states[wheel].append
-            node.create_subscription(MotorState, f"/{wheel}/motor_state", kept, STREAM)
+            node.create_subscription(MotorState, f"{space}/{wheel}/motor_state", kept, STREAM)
             sent = self.commands[wheel].append
-            node.create_subscription(MotorCommand, f"/{wheel}/motor_command", sent, STREAM)
+            node.create_subscription(MotorCommand, f"{space}/{wheel}/motor_command", sent, STREAM)
         node.create_subscription(PidState, "/front_left/pid_state", self.pid_states.append, STREAM)
         node.create_subscription(DiagnosticArray, "/diagnostics", self._diagnosed, 100)
-        self.setpoints = node.create_publisher(JointState, "/wheel_setpoints", 10)
+        self.setpoints = node.create_publisher(JointState, f"{space}/wheel_setpoints", 10)
         self.feedback = {}
         self.load = node.create_publisher(Float64, "/front_left/load_torque", 10)
 

@@ -11,6 +11,7 @@ from typing import Any
 
 import pytest
 import yaml
+from wheel_robot import WheelRobot
 
 from smp_motor_control import WHEELS
 from smp_motor_ident.report.document import read_identification
@@ -28,67 +29,62 @@ BUSY = (
 """Findings that a busy machine may cause."""
 
 
-def test_it_checks_identifies_tunes_and_drives_the_running_robot(
-    process, robot, eventually, tmp_path
+def test_it_checks_identifies_tunes_drives_and_applies_later(
+    process, ros_domain, eventually, tmp_path
 ):
+    space = ("--ros-args", "-r", "__ns:=/robot1")
     paper = yaml.safe_load((ROOT / "config" / "motors_paper.yaml").read_text())
     motors = paper["/**/motor_plant"]["ros__parameters"]["motors"]
     for wheel in set(motors) - set(TWO):
         del motors[wheel]
     (tmp_path / "motors.yaml").write_text(yaml.safe_dump(paper))
-    process("motor_plant", "--ros-args", "-p", f"motors_file:={tmp_path / 'motors.yaml'}")
-    for wheel in TWO:
-        process("wheel_pid", "--ros-args", "-r", f"__ns:=/{wheel}")
-    eventually(lambda: all(robot.states[w] for w in TWO), 60.0, robot.spin, "no robot")
-    accepted = [part for code in BUSY for part in ("--accept", code)]
-    chosen = [part for wheel in TWO for part in ("--wheel", wheel)]
-    tool = process(
-        "commission", "--output", "r", "--duration", "3", "--yes", "--apply",
-        "--motors", "motors.yaml", *chosen, *accepted,
-    )  # fmt: skip
-    assert tool.wait(600.0) == 0, tool.output
-    estimates = read_identification(tmp_path / "r" / "identification")
-    assert set(estimates) == set(TWO)
-    # Motor 1 of Table 1; short signals on a busy machine still tell it to a percent.
-    assert estimates["front_left"].value("dc_gain") == pytest.approx(25.548, rel=0.01)
-    assert (tmp_path / "r" / "gains.yaml").is_file()
-    document = json.loads((tmp_path / "r" / "commissioning.json").read_text())
-    assert document["passed"]
-    # Every wheel was checked, judged by a run of its own, and driven forward and in reverse.
-    assert set(document["checks"]) == set(TWO)
-    codes = [f["code"] for f in document["findings"]]
-    assert codes.count("validation_run") == len(TWO) and "gear_ratio_unknown" not in codes
-    assert len(document["changes"]) == 2 * len(TWO)
-    # The controllers, switched off meanwhile, run again with the new gains.
-    for _ in range(100):
-        robot.send_setpoint(1.0)
-        robot.spin_for(0.02)
-    assert robot.velocity("front_left") == pytest.approx(1.0, abs=0.1)
-
-
-def test_gains_are_driven_on_a_new_controller_if_none_runs(process, robot, eventually, tmp_path):
-    namespace = ("--ros-args", "-r", "__ns:=/robot1")
-    process("motor_plant", *namespace)
-    heard = robot.node.count_publishers
-    eventually(lambda: heard("/robot1/rear_left/motor_state"), 60.0, robot.spin, "no robot")
-    accepted = [part for code in BUSY for part in ("--accept", code)]
-    tool = process(
-        "commission", "--output", "r", "--duration", "3", "--yes", "--wheel", "rear_left",
-        *accepted, *namespace,
-    )  # fmt: skip
-    assert tool.wait(600.0) == 0, tool.output
-    begin = tool.output.index("no wheel_pid runs for rear_left")
-    assert begin < tool.output.index("checking rear_left")  # said before anything moves
-    document = json.loads((tmp_path / "r" / "commissioning.json").read_text())
-    assert document["passed"] and [one["name"] for one in document["changes"]] == [
-        "forward", "reverse",
-    ]  # fmt: skip
-    # It has ended with the tool.
-    eventually(lambda: not heard("/robot1/rear_left/motor_command"), 30.0, robot.spin)
-    # What passed is not done again.
-    again = process("commission", "--output", "r", "--yes", "--resume", *namespace)
-    assert again.wait(60.0) == 0, again.output
-    assert "nothing is left to do" in again.output
+    process("motor_plant", *space, "-p", f"motors_file:={tmp_path / 'motors.yaml'}")
+    robot = WheelRobot(ros_domain, "/robot1")
+    try:
+        eventually(lambda: all(robot.states[w] for w in TWO), 60.0, robot.spin, "no robot")
+        accepted = [part for code in BUSY for part in ("--accept", code)]
+        chosen = [part for wheel in TWO for part in ("--wheel", wheel)]
+        tool = process(
+            "commission", "--output", "r", "--duration", "3", "--yes", "--motors", "motors.yaml",
+            *chosen, *accepted, *space,
+        )  # fmt: skip
+        assert tool.wait(600.0) == 0, tool.output
+        begin = tool.output.index("no wheel_pid runs for front_left, rear_left")
+        assert begin < tool.output.index("checking front_left")  # said before anything moves
+        estimates = read_identification(tmp_path / "r" / "identification")
+        assert set(estimates) == set(TWO)
+        # Motor 1 of Table 1; short signals on a busy machine still tell it to a percent.
+        assert estimates["front_left"].value("dc_gain") == pytest.approx(25.548, rel=0.01)
+        assert (tmp_path / "r" / "gains.yaml").is_file()
+        document = json.loads((tmp_path / "r" / "commissioning.json").read_text())
+        assert document["passed"]
+        # Every wheel was checked, judged by a run of its own, and driven forward and in reverse.
+        assert set(document["checks"]) == set(TWO)
+        codes = [f["code"] for f in document["findings"]]
+        assert codes.count("validation_run") == len(TWO) and "gear_ratio_unknown" not in codes
+        assert [one["name"] for one in document["changes"]] == ["forward", "reverse"] * len(TWO)
+        # Its own controllers have ended with the tool, and what passed is not done again.
+        counted = robot.node.count_publishers
+        commands = [f"/robot1/{wheel}/motor_command" for wheel in TWO]
+        eventually(lambda: not any(map(counted, commands)), 30.0, robot.spin)
+        again = process("commission", "--output", "r", "--yes", "--resume", *space)
+        assert again.wait(60.0) == 0, again.output
+        assert "nothing is left to do" in again.output
+        # Controllers that run get the gains after one more drive, and nothing else is repeated.
+        for wheel in TWO:
+            process("wheel_pid", "--ros-args", "-r", f"__ns:=/robot1/{wheel}")
+        eventually(lambda: all(map(counted, commands)), 30.0, robot.spin)
+        applied = process("commission", "--output", "r", "--yes", "--resume", "--apply",
+                          *accepted, *space)  # fmt: skip
+        assert applied.wait(120.0) == 0, applied.output
+        assert "[1/1] driving" in applied.output
+        # They were inactive meanwhile, and run again with the new gains.
+        for _ in range(100):
+            robot.send_setpoint(1.0)
+            robot.spin_for(0.02)
+        assert robot.velocity("front_left") == pytest.approx(1.0, abs=0.1)
+    finally:
+        robot.close()
 
 
 def test_two_robots_on_one_topic_are_named_before_anything_moves(
