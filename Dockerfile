@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 # ROS 2 Jazzy with this package built: docker build -t smp_motor_control . && docker run --rm -it smp_motor_control
 FROM ros:jazzy AS dependencies
 SHELL ["/bin/bash", "-o", "pipefail", "-c"]

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 # Source this file (bash or zsh): `. ./setup.bash`. It puts the executables of smp_motor_control, its Python and the ROS
 # that `make setup` chose into this shell. It changes nothing else: which hosts discover each other stays your choice.
 

@@ -1,4 +1,5 @@
 #!/usr/bin/env bash
+# SPDX-License-Identifier: Apache-2.0
 # Every guard, each to its end, then one line per guard: `make check`. Names as arguments run those only.
 set -u
 cd -- "$(dirname -- "${BASH_SOURCE[0]}")/.." || exit

@@ -1,4 +1,5 @@
 #!/bin/sh
+# SPDX-License-Identifier: Apache-2.0
 # Resolve the ranges of setup.py and requirements/*.in into lock files that hold for Python 3.10 to 3.13: `make lock`.
 # Needs uv (pip install uv).
 # Pins that are already in a lock file stay, unless `make lock ARGS=--upgrade`.
@@ -23,5 +24,5 @@ lock wheels.txt 3.10 ../setup.py --extra ros --extra xlsx --extra matlab ros.in 
 lock jazzy.txt 3.12 ../setup.py --extra xlsx --extra matlab colcon.in dev.in "$@" --override jazzy-apt.in
 packaged=$(sed -n 's/^\([a-z0-9-]*\)==.*/\1/p' jazzy-apt.in | paste -sd '|')
 without jazzy.txt "^($packaged)=="
-sed -i "1i # What Ubuntu 24.04 with ROS 2 Jazzy lacks; made by \`make lock\` from base.in, colcon.in, dev.in less jazzy-apt.in." jazzy.txt
-sed -i "1i # All that is needed without ROS, Python 3.10 to 3.13; made by \`make lock\` from ros.in, base.in, dev.in." wheels.txt
+sed -i "1i # What Ubuntu 24.04 with ROS 2 Jazzy lacks; made by \`make lock\` from setup.py, colcon.in, dev.in less jazzy-apt.in." jazzy.txt
+sed -i "1i # All that is needed without ROS, Python 3.10 to 3.13; made by \`make lock\` from setup.py, ros.in, dev.in." wheels.txt

@@ -1,4 +1,5 @@
 #!/bin/sh
+# SPDX-License-Identifier: Apache-2.0
 # Prepare everything that `make demo`, `make test` and setup.bash need: find a Python, let environment.py do the work.
 # PYTHON=/path/to/python3 chooses the Python; without it the one that made .venv, python3, then the newest in range.
 set -eu

@@ -1,4 +1,5 @@
 #!/usr/bin/env bash
+# SPDX-License-Identifier: Apache-2.0
 # Installs the last commit as strangers do and runs it to the end: `scripts/stranger.sh [pip] [colcon]`, default both.
 #   pip     `pip install .` in an empty environment: a CSV file to its report and gains.
 #   colcon  plain `colcon build` beside two other packages: a simulated robot is recorded, identified, tuned and driven.
