@@ -79,7 +79,8 @@ def test_table_of_effects_is_the_catalogue():
 def test_program_of_the_page_prints_what_the_page_shows(capsys):
     text = page("identification.md")
     (program,) = fences(text, "python")
-    shown = fences(text, "text")[1].splitlines()
+    (printed,) = fences(text, "text")
+    shown = printed.splitlines()
     exec(compile(program, "identification", "exec"), {})
     for line, fresh in zip(shown, capsys.readouterr().out.splitlines(), strict=True):
         assert NUMBER.sub("#", line) == NUMBER.sub("#", fresh)
