@@ -229,8 +229,8 @@ def period_with(motor, delay: float) -> float:
 
 def test_relay_on_a_running_wheel_gives_gains_without_a_model(process, robot, eventually, tmp_path):
     output = tmp_path / "relay.yaml"
-    # Twenty seconds hold enough cycles between the pauses of a busy machine.
-    options = ("--supply", "12", "--relay-seconds", "20", "--output", output)
+    # Ten seconds hold enough cycles between the pauses of a busy machine.
+    options = ("--supply", "12", "--relay-seconds", "10", "--output", output)
     code, said = run_tune(process, "--relay", "rear_right", *options)
     assert code == 0, said
     gains = yaml.safe_load(output.read_text())["/**/rear_right/wheel_pid"]["ros__parameters"]
