@@ -113,6 +113,11 @@ def _check(motor: Motor, series: dict[str, Series]) -> None:
                     f"{motor.where}: the count stays at {last}, the end of a counter's range: "
                     "it is full; record a wider one, or one that wraps"
                 )
+            if checks.is_of_two_publishers(value.astype(np.float64)):
+                raise BagError(
+                    f"{motor.where}: the count jumps to and fro between two courses, so that two "
+                    "nodes published it at once; end one of them and record anew"
+                )
             count = unwrap_counts(motor, series).count
             value = (count - count[:1]).astype(np.float64)
             step = np.quantile(np.abs(np.diff(value)), 0.9) if value.size > 1 else 0.0

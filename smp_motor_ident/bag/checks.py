@@ -6,7 +6,13 @@ from numpy.lib.stride_tricks import sliding_window_view
 
 from smp_motor_control.arrays import Array, Flags
 from smp_motor_ident.bag.axis import Series
-from smp_motor_ident.bag.limits import MAX_JUMP_SPAN, MAX_JUMP_STEP, UNSIGNED_CURRENT_RATIO
+from smp_motor_ident.bag.limits import (
+    MAX_JUMP_SPAN,
+    MAX_JUMP_STEP,
+    MIN_COUNTS_BETWEEN_PUBLISHERS,
+    MIN_RETURNING_SHARE,
+    UNSIGNED_CURRENT_RATIO,
+)
 from smp_motor_ident.errors import BagError
 
 _MIN_SAMPLES = 50
@@ -42,6 +48,15 @@ def find_impossible_values(value: Array, *, steps_allowed: bool) -> Flags:
             bad |= both & (away > 0.5 * span) & (usual > 0)
     none[sound[bad]] = True
     return none
+
+
+def is_of_two_publishers(count: Array) -> bool:
+    """Return whether a count jumps to and fro between two courses from sample to sample."""
+    there = np.abs(np.diff(count))[:-1]
+    back = np.abs(count[2:] - count[:-2])
+    returns = (there > MIN_COUNTS_BETWEEN_PUBLISHERS.value) & (back < 0.1 * there)
+    # Fewer samples may do so by chance.
+    return bool(count.size > 4 * _MIN_SAMPLES and np.mean(returns) > MIN_RETURNING_SHARE.value)
 
 
 def is_unsigned(voltage: Series, current: Series) -> bool:

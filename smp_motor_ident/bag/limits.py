@@ -126,6 +126,20 @@ MAX_COUNT_STEP = Limit(
     "physical: an encoder of a million counts at 100,000 rpm makes half of it in a second",
     "test_counter.py",
 )
+MIN_COUNTS_BETWEEN_PUBLISHERS = Limit(
+    1000.0,
+    "count",
+    "physical: no wheel turns so far forth and back from sample to sample; two publishers of one "
+    "topic, each with its own count, seem to",
+    "test_checks.py",
+)
+MIN_RETURNING_SHARE = Limit(
+    0.25,
+    "1",
+    "physical: of two publishers, one of which may send twice as often, a third of the samples "
+    "lies between two of the other",
+    "test_checks.py",
+)
 MAX_ROW_INTERVAL_S = Limit(
     10.0,
     "s",

@@ -92,6 +92,16 @@ def test_a_counter_that_turns_to_and_fro_where_it_wraps_loses_no_sample(tmp_path
     np.testing.assert_array_equal(np.diff(record.count), np.diff(to_and_fro))
 
 
+@pytest.mark.parametrize("every", [2, 3])
+def test_a_count_of_two_publishers_is_named(tmp_path, every):
+    count = COUNT.copy()
+    count[::every] = 70_000  # a forgotten node whose motor stands
+    with pytest.raises(BagError, match=r"jumps to and fro.*two nodes published it"):
+        read_count(tmp_path / "log.csv", count)
+    count[::every] = COUNT[::every] + 900  # closer than a wheel turns in a sample
+    read_count(tmp_path / "log.csv", count)
+
+
 @pytest.mark.parametrize("kind", ["armature", "offset", "without sign", "supply"])
 def test_a_current_without_sign_is_left_out_and_the_speed_kept(tmp_path, kind):
     speed = motion()
