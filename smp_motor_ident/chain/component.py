@@ -52,6 +52,7 @@ class Parameter:
     high: float = np.inf
     neutral: float = 0.0  # value without effect
     typical: float = 1.0  # standard deviation of the prior, in that unit
+    threshold: bool = False  # whether it only tells which commands act
 
     def difference(self, scales: Scales) -> float:
         """Return the step of a finite difference."""

@@ -46,7 +46,7 @@ class HardDeadZone(Component):
     )
     severity = "warning"
     advice = "lower the least command of the firmware, or keep commands above it"
-    parameters = (Parameter("least_command", "V", 0.0, 0.6, typical=0.1),)
+    parameters = (Parameter("least_command", "V", 0.0, 0.6, typical=0.1, threshold=True),)
     EDGE = 0.02
     """Share of the largest command over which it sets in, so that it has a derivative."""
 

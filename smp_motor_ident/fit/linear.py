@@ -15,7 +15,7 @@ import numpy as np
 
 from smp_motor_control.arrays import Array, Integers
 from smp_motor_ident.chain.chain import Chain, Constraint, respond
-from smp_motor_ident.chain.component import Parameter, Scales
+from smp_motor_ident.chain.component import Scales
 from smp_motor_ident.chain.quantities import jacobian
 from smp_motor_ident.fit.data import Data
 from smp_motor_ident.fit.noise import Noise
@@ -191,18 +191,14 @@ def prior_rows(chain: Chain, scales: Scales) -> tuple[Array, Array, tuple[str, .
             residuals.append(off / size)
             rows.append(list(row / size))
             causes.append(constraint.quantity)
+    # A parameter without effect gets a standard deviation of ten times its size, and stays.
     for j, p in enumerate(chain.free):
         residuals.append(0.0)
         causes.append(p.name)
         rows.append([0.0] * len(names))
-        rows[-1][j] = stay_weight(p, scales)
+        rows[-1][j] = 0.1 / (max(p.typical, 1.0) * scales.of(p.unit))
     made = np.array(rows).reshape(len(rows), len(names))
     return np.array(residuals), made, tuple(causes)
-
-
-def stay_weight(parameter: Parameter, scales: Scales) -> float:
-    """Return the inverse of ten times the size of a parameter, which stays if it has no effect."""
-    return 0.1 / (max(parameter.typical, 1.0) * scales.of(parameter.unit))
 
 
 def _constrained(chain: Chain, constraint: Constraint) -> tuple[Array, float, float]:

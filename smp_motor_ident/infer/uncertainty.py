@@ -23,7 +23,6 @@ from smp_motor_ident.chain.quantities import REPORTED
 from smp_motor_ident.fit.adequacy import scatters
 from smp_motor_ident.fit.data import SEARCH_ROWS, Data
 from smp_motor_ident.fit.descend import Fit, restate
-from smp_motor_ident.fit.linear import stay_weight
 from smp_motor_ident.fit.search import (
     SelectionPolicy,
     candidates,
@@ -60,7 +59,7 @@ def contributions(
 
     ``timing``: accuracy of the instants of the readings [s].
     """
-    parts = [*of_noise(found), *of_priors(found), *of_plateaus(data, found)]
+    parts = [*of_noise(found), *of_priors(found), *of_thresholds(data, found)]
     if levels.steady and "vc" in found.names:
         parts.append(of_one_level(found))
     for one in scatters(data, found):
@@ -92,44 +91,27 @@ def of_priors(found: Fit) -> list[Contribution]:
     m = found.linear.row.size
     nothing = np.zeros_like(found.covariance)
     shifts = found.linear.columns[m:] @ found.covariance
+    thresholds = [p.name for p in found.chain.free if p.threshold]
     return [
         Contribution(name, nothing, shift)
         for name, shift in zip(found.priors, shifts, strict=True)
-        if name not in _flat(found)
+        if name not in thresholds
     ]
 
 
-def of_plateaus(data: Data, found: Fit) -> Iterator[Contribution]:
-    """Yield how far a parameter may move where no derivative shows it.
+def of_thresholds(data: Data, found: Fit) -> Iterator[Contribution]:
+    """Yield where a size of command that the driver tells from smaller ones may lie.
 
-    A least command between two commands of the recording is such a parameter.
+    It is anywhere between two commands of the recording, as the estimate is.
     """
-    for name in _flat(found):
-        k = found.names.index(name)
-        covariance = np.zeros_like(found.covariance)
-        covariance[k, k] = max(_reach(data, found, name, side) for side in (-1.0, 1.0)) ** 2
-        yield Contribution(name, covariance)
-
-
-def _flat(found: Fit) -> list[str]:
-    """Return the parameters that only their weakest prior holds."""
-    loose = np.diag(found.linear.normal)
-    held = [stay_weight(p, found.scales) ** 2 for p in found.chain.free]
-    return [n for n, one, least in zip(found.names, loose, held, strict=True) if one < 2 * least]
-
-
-def _reach(data: Data, found: Fit, name: str, side: float) -> float:
-    """Return how far a parameter moves to one side before the sum of squares grows by 1."""
-    k = found.names.index(name)
-    unit = found.scales.of(found.chain.free[k].unit)
-    most = float(np.square(found.linear.residual[: found.linear.row.size]).sum()) + 1.0
-    reach = 0.0
-    for step in unit * 0.5 ** np.arange(12):
-        value = found.chain.values[name] + side * (reach + step)
-        r = found.residual(data, found.chain.with_values({name: value}))
-        if r is not None and float(r @ r) < most:
-            reach += step
-    return reach
+    size = np.sort(np.abs(data.rows.command))
+    for k, parameter in enumerate(found.chain.free):
+        if parameter.threshold:
+            at = int(np.searchsorted(size, found.chain.values[parameter.name]))
+            lower, upper = size[max(at - 1, 0)], size[min(at, size.size - 1)]
+            covariance = np.zeros_like(found.covariance)
+            covariance[k, k] = (upper - lower) ** 2 / 6
+            yield Contribution(parameter.name, covariance)
 
 
 def of_one_level(found: Fit) -> Contribution:
