@@ -181,7 +181,8 @@ class WheelController:
         elif age > self.settings.setpoint_timeout:
             self.refuse("set-point older than its time-out")
         else:
-            self.setpoint = value
+            # The feed-forward of friction is the same however small the set-point is.
+            self.setpoint = value if abs(value) > STANDSTILL_SETPOINT else 0.0
             self._setpoint_at = now
             self._stop.ask(value, now)
 

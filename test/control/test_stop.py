@@ -125,6 +125,14 @@ def test_the_offset_of_a_joystick_at_rest_counts_as_zero():
     assert abs(world.speed) < REST_SPEED
 
 
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_the_offset_of_a_joystick_gets_no_feed_forward_of_friction(sign):
+    world = World(settings(PidGains(feedforward_static=3.0, u_clamp_min=-12.0, u_clamp_max=12.0)))
+    world.setpoint = sign * STANDSTILL_SETPOINT
+    world.run(1.0)
+    assert world.held == 0.0 and world.speed == 0.0
+
+
 def test_a_slow_set_point_does_not_count_as_zero():
     world = World().run(2.0)
     world.setpoint = 0.1
