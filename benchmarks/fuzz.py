@@ -4,9 +4,13 @@
     python benchmarks/fuzz.py [--files 20000] [--seed 1] [--formats mcap csv ...]
 
 Each file is a sound one (written by rosbags, mcap, sqlite3, scipy, h5py, openpyxl or by hand) with
-some of its bytes changed, cut off, doubled, moved or replaced by extreme numbers.  Outcomes: an
-answer; a partial answer with a warning; a refusal of one line.  Anything else fails: a
-traceback, more than 30 s, more than 1 GB of memory.  Every failure is printed with its number.
+some of its bytes changed, cut off, doubled, moved or replaced by extreme numbers.  The kinds in
+PACKED spoil the content and then write a sound file around it: the XML of a workbook, the stamps
+of a bag, the paths of an HDF5 file or of a folder with its links and pipes.
+
+Outcomes: an answer; a partial answer with a warning; a refusal of one line.  Anything else
+fails: a traceback, more than 30 s, more than 1 GB of memory.  Every failure is printed with its
+number.
 """
 
 from __future__ import annotations
@@ -16,14 +20,17 @@ import contextlib
 import io
 import json
 import multiprocessing
+import os
 import random
 import resource
+import shutil
 import signal
 import sqlite3
 import struct
 import sys
 import tempfile
 import time
+import zipfile
 from collections import Counter
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
@@ -75,8 +82,11 @@ def _messages(ros1: bool) -> tuple[Any, list[tuple[str, str, int, bytes]]]:
     return store, sent
 
 
-def _mcap(kind: str) -> bytes:
+def _mcap(kind: str, stamps: bytes | None = None) -> bytes:
     store, sent = _messages(False)
+    if stamps is not None:
+        times = struct.iter_unpack("<Q", stamps[: len(stamps) // 8 * 8])
+        sent = [(*one[:2], at, one[3]) for one, (at,) in zip(sent, times)]
     file, ids = io.BytesIO(), {}
     writer = mcap.writer.Writer(
         file, chunk_size=2048, compression=mcap.writer.CompressionType[kind]
@@ -171,6 +181,12 @@ def _csv(separator: str) -> bytes:
     return "\n".join(lines).encode()
 
 
+def _wide() -> bytes:
+    head, *rows = _csv(",").split(b"\n")
+    names = b"".join(b",c%d" % k for k in range(2000))
+    return b"\n".join([head + names, *(row + b",0" * 2000 for row in rows)])
+
+
 def _sysid() -> bytes:
     rows = np.stack([T, U, Y, Y], axis=1).tolist()
     return json.dumps({"sysid": True, "units": "Rotations", "slow-forward": rows}).encode()
@@ -238,6 +254,72 @@ def _metadata() -> bytes:
     ).encode()
 
 
+def _stamps() -> bytes:
+    return b"".join(struct.pack("<Q", at) for _, _, at, _ in _messages(False)[1])
+
+
+def _sheet() -> bytes:
+    with zipfile.ZipFile(io.BytesIO(_xlsx())) as book:
+        return book.read(SHEET)
+
+
+def _pack_sheet(data: bytes, path: Path) -> Path:
+    with zipfile.ZipFile(io.BytesIO(_xlsx())) as book, zipfile.ZipFile(path, "w") as new:
+        for item in book.infolist():
+            new.writestr(item, data if item.filename == SHEET else book.read(item))
+    return path
+
+
+def _pack_stamps(data: bytes, path: Path) -> Path:
+    path.write_bytes(_mcap("NONE", data))
+    return path
+
+
+def _pack_groups(data: bytes, path: Path) -> Path:
+    """Write an HDF5 file of the variables "PATH=COLUMN" and the links "PATH>PATH"."""
+    columns = {"t": T, "u": U, "y": Y}
+    with h5py.File(path, "w", userblock_size=512) as file:
+        for line in data.decode("latin-1").replace("\0", "").splitlines():
+            name, variable, column = line.partition("=")
+            link, _, goal = line.partition(">")
+            with contextlib.suppress(OSError, ValueError, RuntimeError, KeyError):
+                if variable:
+                    file[name] = columns.get(column, np.zeros(3))
+                else:
+                    file[link] = h5py.SoftLink(goal) if len(goal) % 2 else file[goal]
+    path.write_bytes(b"MATLAB 7.3 MAT-file" + path.read_bytes()[19:])
+    return path
+
+
+def _pack_folder(data: bytes, path: Path) -> Path:
+    """Write a folder of the files "PATH=", the pipes "PATH|" and the links "PATH>PATH"."""
+    path.mkdir()
+    for line in data.replace(b"\0", b"").splitlines():
+        name = line.rstrip(b"=|").partition(b">")[0].replace(b"..", b"").lstrip(b"/")
+        new, goal = os.path.join(os.fsencode(path), name), line.partition(b">")[2]
+        with contextlib.suppress(OSError, ValueError):
+            os.makedirs(os.path.dirname(new), exist_ok=True)
+            if line.endswith(b"|"):
+                os.mkfifo(new)
+            elif goal:
+                inside = goal.replace(b"..", b"").lstrip(b"/")
+                os.symlink(goal if goal == b"/dev/zero" else inside or b".", new)
+            else:
+                Path(os.fsdecode(new)).write_bytes(_csv(","))
+    return path
+
+
+SHEET = "xl/worksheets/sheet1.xml"
+PLACES = b"a/log.csv=\na/b/log.csv=\nlog.csv=\na/self>.\nlink>a\npipe.csv|\nzero>/dev/zero\n"
+GROUPS = b"t=t\nu=u\ng/y=y\ng/h/i/j=y\nlink>/g\nself>/link\n"
+PACKED: dict[str, Callable[[bytes, Path], Path]] = {
+    "xlsx sheet": _pack_sheet,
+    "mcap stamps": _pack_stamps,
+    "mat 7.3 groups": _pack_groups,
+    "folder": _pack_folder,
+}
+"""The functions that write a spoilt content as a sound file."""
+
 SEEDS: dict[str, tuple[str, Callable[[], bytes], list[str] | None]] = {
     "mcap": ("a.mcap", lambda: _mcap("NONE"), MESSAGES),
     "mcap zstd": ("a.mcap", lambda: _mcap("ZSTD"), MESSAGES),
@@ -267,6 +349,11 @@ SEEDS: dict[str, tuple[str, Callable[[], bytes], list[str] | None]] = {
     "csv blanks": ("a.txt", lambda: _csv(" "), COLUMNS),
     "metadata": ("metadata.yaml", _metadata, MESSAGES),
     "mapping": ("map.yaml", lambda: b"motors:\n  left: {voltage: /pwm.data, velocity: y}\n", None),
+    "csv wide": ("a.csv", _wide, COLUMNS),
+    "xlsx sheet": ("a.xlsx", _sheet, COLUMNS),
+    "mcap stamps": ("a.mcap", _stamps, MESSAGES),
+    "mat 7.3 groups": ("a.mat", lambda: GROUPS, ["voltage=u velocity=g.y time=t"]),
+    "folder": ("folder", lambda: PLACES, COLUMNS),
     "msg": ("Float64.msg", lambda: b"float64 data\nFloat64[<=3] more\nuint8 X=1\n", MESSAGES),
 }
 """File name, its sound bytes, and the mapping, by format."""
@@ -277,7 +364,8 @@ EXTREME = [
     *(struct.pack("<d", v) for v in (np.nan, np.inf, 1e300, -1e-300)),
     b"\0", b"\xff" * 16, b"\n", b",", b"[" * 4000, b"{" * 3000, b'{"a":' * 2000, b"9" * 5000,
     b"1152921504606846976", b"-9223372036854775808", b"2262-05-01 00:00:00", b"1e18", b"\r;",
-    b'"', b"%", b"1e999", b"&a [*a]", b"- " * 2000, b"\x28\xb5\x2f\xfd", b"\x04\x22\x4d\x18",
+    b'"', b"%", b"1e999", b"&a [*a]", b"- " * 2000, b'1048577"', b"XFE", b"1," * 5000, b"g/" * 900,
+    b"\nb>a\nb>/\n", b"\nself>.\n", b"\xff.csv=\n", b"\x28\xb5\x2f\xfd", b"\x04\x22\x4d\x18",
 ]  # fmt: skip
 
 
@@ -309,8 +397,9 @@ def outcome(name: str, data: bytes, folder: Path) -> str:
     """Return what comes of a file: an answer, a partial answer, a refusal of one line."""
     file, _, mapping = SEEDS[name]
     path = folder / file
-    path.write_bytes(data)
-    target: Path = path
+    target = PACKED[name](data, path) if name in PACKED else path
+    if name not in PACKED:
+        path.write_bytes(data)
     if name == "metadata":
         (folder / "a.mcap").write_bytes(SOUND["mcap"])
         target = folder
@@ -330,7 +419,7 @@ def outcome(name: str, data: bytes, folder: Path) -> str:
         text = str(error)
         return "refused" if text and "\n" not in text and len(text) < 4000 else "long message"
     finally:
-        path.unlink()
+        shutil.rmtree(path) if path.is_dir() else path.unlink()
         (folder / "a.mcap").unlink(missing_ok=True)
         (folder / "a.db3").unlink(missing_ok=True)
     found = [f for r in records.values() for f in r.findings] + [
