@@ -26,7 +26,14 @@ MAX_PERIOD_SCATTER = 0.3  # maximum relative standard deviation of the periods; 
 MIN_SMOOTHNESS = 0.75
 """Minimum ratio of error to second difference: 0.41 for white noise, 1 for six-sample cycles."""
 
-SMOOTHNESS_MEMORY_S = 0.5  # averaging time of that ratio
+MAX_TONE_RESIDUAL = 0.35
+"""Maximum power of ``e(k) + e(k-2) - c e(k-1)`` with the best c, relative to the error's.
+
+A cycle of any number of samples has 0, white noise 2."""
+
+SMOOTHNESS_MEMORY_S = 0.5  # averaging time of both ratios
+
+SMOOTHNESS_SAMPLES = 20  # minimum averaging time in samples
 
 OFFSET_MEMORY_S = 1.0  # averaging time of the constant error, as without integral action
 
@@ -64,7 +71,8 @@ class Oscillation:
     def _begin(self, reference: float) -> None:
         self._reference = reference
         self._halves: deque[tuple[float, float]] = deque(maxlen=HALF_SWINGS)  # instant, peak
-        self._offset = self._before = self._slope = self._power = self._bend = 0.0
+        self._offset = self._before = self._older = 0.0
+        self._xx = self._xy = self._yy = 0.0  # means of products of e(k-1) and e(k) + e(k-2)
         self._side = self._time = self._turned_at = self._peak = self._way = 0.0
 
     def add(self, dt: float, reference: float, speed: float) -> None:
@@ -76,11 +84,12 @@ class Oscillation:
         error = speed - reference
         self._offset += min(dt / OFFSET_MEMORY_S, 1.0) * (error - self._offset)
         error -= self._offset
-        slope = error - self._before
-        share, bend = min(dt / SMOOTHNESS_MEMORY_S, 1.0), slope - self._slope
-        self._power += share * (error * error - self._power)
-        self._bend += share * (bend * bend - self._bend)
-        self._before, self._slope = error, slope
+        share = min(dt / SMOOTHNESS_MEMORY_S, 1.0 / SMOOTHNESS_SAMPLES)
+        x, y = self._before, error + self._older
+        self._xx += share * (x * x - self._xx)
+        self._xy += share * (x * y - self._xy)
+        self._yy += share * (y * y - self._yy)
+        self._before, self._older = error, x
         least = max(MIN_AMPLITUDE, MIN_AMPLITUDE_SHARE * abs(reference))
         side = math.copysign(1.0, error) if abs(error) > least else 0.0
         if side and side != self._side:
@@ -101,8 +110,14 @@ class Oscillation:
             halves.append((self._time, self._peak))
         self._side, self._turned_at, self._peak, self._way = side, self._time, 0.0, 0.0
         if len(halves) == HALF_SWINGS and self._time > MIN_DURATION_S:
-            smooth = self._power > MIN_SMOOTHNESS * MIN_SMOOTHNESS * self._bend
-            self.found = _find_cycle(halves) if smooth else None
+            self.found = _find_cycle(halves) if self._is_regular() else None
+
+    def _is_regular(self) -> bool:
+        """Return whether the error is smooth or a tone, which noise is not."""
+        xx, xy, yy = self._xx, self._xy, self._yy
+        bend = yy - 4.0 * xy + 4.0 * xx
+        tone = yy * xx - xy * xy < MAX_TONE_RESIDUAL * xx * xx
+        return tone or xx > MIN_SMOOTHNESS * MIN_SMOOTHNESS * bend
 
 
 def _find_cycle(halves: Sequence[tuple[float, float]]) -> Swing | None:

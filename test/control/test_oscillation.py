@@ -45,12 +45,14 @@ def drive(
     noise: float = 0.0,
     seconds: float = 8.0,
     seed: int = 0,
+    motor: str = "front_left",
+    latch: bool = True,
 ) -> tuple[float, WheelController]:
-    """Drive the paper's first motor; return when a swing was found [s], and the controller."""
-    entry, draw = load_motors(CONFIG / "motors_paper.yaml")["front_left"], random.Random(seed)
+    """Drive one of the paper's motors; return when a swing was found [s], and the controller."""
+    entry, draw = load_motors(CONFIG / "motors_paper.yaml")[motor], random.Random(seed)
     wheel = WheelController(settings)
     wheel.set_hardware(entry.gearbox, entry.encoder, entry.supply_voltage)
-    plant = DrivenMotor(entry, DriveSettings(pwm_steps=1000, latch=True), start=100.0)
+    plant = DrivenMotor(entry, DriveSettings(pwm_steps=1000, latch=latch), start=100.0)
     wheel.activate(100.0)
     found = math.inf
     for k in range(1, round(seconds * rate)):
@@ -88,6 +90,13 @@ def test_gains_beyond_the_limit_of_stability_are_named_at_any_rate(rate, p):
     assert found < 5.0 and wheel.state is State.DRIVING
 
 
+@pytest.mark.parametrize(("rate", "p"), [(15.0, 15.0), (33.0, 6.0), (33.0, 60.0)])
+def test_a_cycle_of_few_samples_is_named(rate, p):
+    """Three to five samples of a slow loop on the most powerful of the motors."""
+    found, wheel = drive(p_alone(p), rate, lambda t: -2.0, motor="rear_left", latch=False)
+    assert found < 5.0 and wheel.state is State.DRIVING
+
+
 @pytest.mark.parametrize("rate", [100.0, 200.0, 500.0])
 @pytest.mark.parametrize("speed", [0.0, 0.02, 0.1, 0.5, 2.4])
 def test_a_wheel_that_follows_swings_at_no_speed(rate, speed):
@@ -113,6 +122,14 @@ def test_a_wheel_that_is_asked_to_swing_is_not_blamed(target):
 def test_noise_is_not_an_oscillation(rate, seed):
     found, _ = drive(given("gains.yaml"), rate, lambda t: 1.0, 0.3, seed=seed)
     assert found == math.inf
+
+
+@pytest.mark.parametrize("rate", [10.0, 33.0, 100.0])
+def test_white_noise_of_any_rate_is_no_cycle(rate):
+    swings, draw = Oscillation(), random.Random(7)
+    for _ in range(round(600 * rate)):
+        swings.add(1.0 / rate, 1.0, 1.0 + draw.gauss(0.0, 1.0))
+        assert swings.found is None
 
 
 def test_a_swing_is_over_when_its_gains_are():
