@@ -81,7 +81,7 @@ def slow_loop(design: Design) -> list[str]:
     if needed <= DriveSettings().command_timeout:
         return []
     return [
-        f"a command comes every {1e3 * interval:.3g} ms: the hardware's driver must hold it for "
+        f"a command comes every {interval:.3g} s: the hardware's driver must hold it for "
         f"{needed:.3g} s (command_timeout), or the wheel falls back to 0 V between two commands"
     ]
 

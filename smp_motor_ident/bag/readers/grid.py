@@ -231,7 +231,8 @@ def _whole(rows: Sequence[Row], j: int, column: NDArray[Any]) -> tuple[NDArray[A
         if timed or isinstance(first, (datetime, date, time)):
             return np.array([nanoseconds(row[j]) for row in rows], np.int64), True
         if np.abs(column).max() >= 2.0**53:
-            return np.array([int(row[j]) for row in rows], np.int64), False
+            whole = [int(row[j]) for row in rows]
+            return np.array(whole, np.int64 if max(whole) < 2**63 else np.uint64), False
     except (ValueError, OverflowError, TypeError):
         pass
     return column, False

@@ -341,10 +341,12 @@ def test_an_angle_that_begins_anew_at_each_run_of_a_joined_log_begins_a_segment(
     np.testing.assert_allclose(record.position[300:600], np.deg2rad(run), atol=1e-9)
 
 
-@pytest.mark.parametrize("offset", [2**53, 2**60, 2**62 + 12_345, -(2**63) + 10**6])
+@pytest.mark.parametrize("offset", [2**53, 2**60, 2**62 + 12_345, -(2**63) + 10**6, 2**64 - 99])
 def test_counts_far_from_zero_keep_every_step(tmp_path, offset):
+    """The last is an unsigned counter, which wraps."""
     true = turning()
-    rows = (f"{0.01 * k:.2f},{k % 5},{n + offset}" for k, n in enumerate(true.tolist()))
+    shown = [(n + offset) % 2**64 if offset > 2**63 else n + offset for n in true.tolist()]
+    rows = (f"{0.01 * k:.2f},{k % 5},{n}" for k, n in enumerate(shown))
     (tmp_path / "log.csv").write_text("\n".join(["t,u,c", *rows]))
     mapping = ["voltage=u count=c time=t counts_per_revolution=2000"]
     record = read_records(tmp_path / "log.csv", mapping)["motor"]
