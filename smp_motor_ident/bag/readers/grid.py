@@ -244,5 +244,7 @@ def _describe_bad_cell(row: Row, use: Sequence[int], names: Sequence[str]) -> st
         try:
             number(row[j] if j < len(row) else None)
         except (ValueError, OverflowError):
-            return f"column {name!r}: {str(row[j])[:40]!r} is not a number"
+            cell = str(row[j]).strip()
+            kind = f"date from {_YEARS[0]} to {_YEARS[-1]}" if _ISO.fullmatch(cell) else "number"
+            return f"column {name!r}: {cell[:40]!r} is not a {kind}"
     return "is not a row of numbers"
