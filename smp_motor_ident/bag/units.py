@@ -4,6 +4,7 @@
 import math
 import re
 from collections.abc import Mapping
+from itertools import product
 from typing import NamedTuple
 
 from smp_motor_ident.errors import BagError
@@ -70,6 +71,13 @@ _ALIASES = {
     for alias in aliases
 }
 
+_WORDS = {
+    **{"rotation": "rev", "turn": "rev", "radian": "rad", "degree": "deg"},
+    **{"meter": "m", "metre": "m", "foot": "ft", "feet": "ft", "inch": "in", "inche": "in"},
+    **{"amp": "A", "second": "s", "sec": "s", "minute": "min", "hour": "h"},
+}
+"""Units by their English names, in the singular."""
+
 
 def check_unit(signal: str, unit: str) -> str:
     """Return the unit under its usual name, the first of the signal's where none is given."""
@@ -91,12 +99,17 @@ def needs(signal: str, unit: str, name: str) -> bool:
 
 
 def written_unit(text: str) -> str | None:
-    """Return the unit that a file writes next to a column's name; None if it is not a unit."""
+    """Return the unit that a file writes next to a column's name; None if it is not a unit.
+
+    It is a symbol, or in words as WPILib writes it: "Rotation per Second", "turns_per_second".
+    """
     if text.strip() in ("", "-", "1", "."):
         return ""
-    for signal in UNITS:
+    parts = re.split(r"[\s_]per[\s_]|/", text.strip().lower())
+    words = "/".join(_WORDS.get(part.strip().removesuffix("s"), part) for part in parts)
+    for signal, form in product(UNITS, (text, words)):
         try:
-            return check_unit(signal, text)
+            return check_unit(signal, form)
         except BagError:
             continue
     return None

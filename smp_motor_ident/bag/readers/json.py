@@ -24,7 +24,7 @@ from smp_motor_ident.bag.limits import MAX_COLUMNS, MAX_STRAY_ROW_SHARE
 from smp_motor_ident.bag.readers import grid
 from smp_motor_ident.bag.readers.format import ColumnFile, Format
 from smp_motor_ident.bag.storage import damaged
-from smp_motor_ident.bag.units import UNITS, needs
+from smp_motor_ident.bag.units import UNITS, needs, written_unit
 from smp_motor_ident.bag.unpack import Budget
 from smp_motor_ident.errors import BagError
 
@@ -41,10 +41,6 @@ _FORMS = {
     (False, 10): (*_OLD, *_SIDES, "gyro"),
 }
 """Names of the columns by their number: of SysId, or of its forerunner."""
-_UNITS = {
-    **{"rotations": "rev", "radians": "rad", "degrees": "deg"},
-    **{"meters": "m", "feet": "ft", "inches": "in"},
-}
 _DEEPEST = 16
 _WIDEST = 64
 _MOST_CELLS = 5_000_000
@@ -187,7 +183,8 @@ def _sysid(
     columns = {key: table[:, k] for k, key in enumerate(form)}
     if str(document.get("test", "Drivetrain")) in _ONE_MOTOR and "left_voltage" in columns:
         columns = {k.removeprefix("left_"): c for k, c in columns.items() if "right" not in k}
-    unit = _UNITS.get(str(document.get("units", "")).lower(), "")
+    unit = written_unit(str(document.get("units", ""))) or ""
+    unit = unit if unit in UNITS["position"] else ""
     units = {}
     for key in columns:
         what = key.rpartition("_")[2]

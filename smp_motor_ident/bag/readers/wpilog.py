@@ -3,9 +3,11 @@
 
 The format is that of github.com/wpilibsuite/allwpilib, ``wpiutil/doc/datalog.adoc``, version 1.0:
 records of entry, payload size and microseconds, each of as many bytes as the record's first
-byte says; entry 0 holds control records that start and finish entries.
+byte says; entry 0 holds control records that start and finish entries.  The metadata of an entry is
+its unit where SysId writes the log, and has a key ``unit`` where AdvantageKit does.
 """
 
+import json
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -14,6 +16,7 @@ import numpy as np
 
 from smp_motor_ident.bag.readers.format import Format, Tables, check_width
 from smp_motor_ident.bag.storage import TABLE, Channel, Table
+from smp_motor_ident.bag.units import written_unit
 from smp_motor_ident.bag.unpack import Budget
 from smp_motor_ident.errors import BagError
 
@@ -27,6 +30,7 @@ class _Entry:
 
     name: str
     kind: str
+    unit: str
     times: list[int] = field(default_factory=list)
     begins: list[int] = field(default_factory=list)
     sizes: list[int] = field(default_factory=list)
@@ -71,20 +75,23 @@ class _Wpilog(Tables):
             active.pop(key, None)
         elif body[:1] == b"\0":
             texts, at = [], 5
-            for _ in range(2):
+            for _ in range(3):
                 size = int.from_bytes(body[at : at + 4], "little")
                 texts.append(body[at + 4 : at + 4 + size].decode("utf-8", "replace"))
                 at += 4 + size
             if texts[1].removesuffix("[]") in _KINDS:
-                active[key] = self._entries.setdefault(texts[0], _Entry(texts[0], texts[1]))
+                entry = _Entry(texts[0], texts[1], _unit(texts[2]))
+                active[key] = self._entries.setdefault(texts[0], entry)
                 check_width(len(self._entries), self.name, "entries")
 
     def channels(self) -> list[Channel]:
         """Return the entries of numbers."""
-        return [
-            Channel(k, name, entry.kind, TABLE, fields=self._fields(entry))
-            for k, (name, entry) in enumerate(sorted(self._entries.items()))
-        ]
+        found = []
+        for k, (name, entry) in enumerate(sorted(self._entries.items())):
+            fields = self._fields(entry)
+            units = dict.fromkeys(fields, entry.unit)
+            found.append(Channel(k, name, entry.kind, TABLE, fields=fields, units=units))
+        return found
 
     @staticmethod
     def _fields(entry: _Entry) -> tuple[str, ...]:
@@ -109,6 +116,16 @@ class _Wpilog(Tables):
             for name, k in zip(fields, index)
         }
         return Table(log[sound], None, columns)
+
+
+def _unit(metadata: str) -> str:
+    """Return the unit that an entry's metadata states; empty without one."""
+    if metadata.startswith("{"):
+        try:
+            metadata = str(json.loads(metadata).get("unit", ""))
+        except (ValueError, RecursionError):
+            return ""
+    return written_unit(metadata) or ""
 
 
 FORMAT = Format("WPILib data log", (".wpilog",), MAGIC, _Wpilog)

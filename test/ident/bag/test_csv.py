@@ -269,7 +269,7 @@ def test_a_column_goes_by_its_name_without_the_unit(tmp_path):
         (table(), ["voltage=u velocity=y"], "the column of time is unknown"),
         (table(), None, "needs a mapping, such as"),
         ("t,u,y\n0,1,2\n", MAP, "fewer than 2"),
-        (lines("2262-05-01T00:00:00.{:03},{},{}", times=range(0, 100, 20)), MAP, "from 1678 to 2261"),
+        (lines("2262-05-01T00:00:00.{:03},{},{}", times=range(0, 100, 20)), MAP, "to 2261"),
         (lines("0,{1},{2}"), MAP, "all 5 rows have the same time, 0 s"),
         (lines("{0},nan,{2}"), MAP, "u holds no number"),
         (lines("{0},{1},"), MAP, "y holds no number"),

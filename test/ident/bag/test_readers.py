@@ -149,7 +149,15 @@ def test_a_matlab_file_of_another_version_or_cut_off_is_one_line(tmp_path):
         read_records(tmp_path / "cut.mat", MAP)
 
 
-def data_log(extra: bytes = b"") -> bytes:
+ENTRIES = ("/drive/left volts", "NT:left/speed")
+
+
+def data_log(
+    extra: bytes = b"",
+    metadata: str = "",
+    speed: np.ndarray = SPEED,
+    names: tuple[str, ...] = ENTRIES,
+) -> bytes:
     """Return a data log by the published layout: records of few and of many bytes."""
 
     def text(value: str) -> bytes:
@@ -162,14 +170,15 @@ def data_log(extra: bytes = b"") -> bytes:
 
     parts = [b"WPILOG", struct.pack("<HI", 0x0100, len(extra)), extra]
     for entry, (name, kind) in enumerate(
-        [("/drive/left volts", "double"), ("NT:left/speed", "double[]"), ("message", "string")], 1
+        zip((*names, "message"), ("double", "double[]", "string")), 1
     ):
-        start = struct.pack("<BI", 0, entry) + text(name) + text(kind) + text("")
+        stated = metadata if entry == 2 else ""
+        start = struct.pack("<BI", 0, entry) + text(name) + text(kind) + text(stated)
         parts.append(record(0, 0, start, wide=False))
     for k in range(N):
         stamp = round(1e6 * TIME[k])
         parts.append(record(1, stamp, struct.pack("<d", VOLTAGE[k]), wide=k % 2 == 0))
-        parts.append(record(2, stamp, struct.pack("<dd", 7.0, SPEED[k]), wide=False))
+        parts.append(record(2, stamp, struct.pack("<dd", 7.0, speed[k]), wide=False))
         parts.append(record(3, stamp, b"hello", wide=True))
     return b"".join(parts)
 
@@ -183,6 +192,28 @@ def test_entries_of_a_wpilib_data_log_are_signals_with_their_own_times(tmp_path)
         "/drive/left volts",
         "NT:left/speed",
     ]
+
+
+@pytest.mark.parametrize(
+    ("metadata", "radius", "factor"),
+    [
+        ("Rotation per Second", "", 2 * np.pi), ("turns_per_second", "", 2 * np.pi),
+        ("Meter per Second", " wheel_radius=0.05", 20.0),
+        ("meters_per_second", " wheel_radius=0.05", 20.0),
+        ('{"source":"AdvantageKit","unit":"radians per second"}', "", 1.0),
+        ('{"source":"NT"}', "", 1.0), ("[[[{", "", 1.0), ("RPM", "", np.pi / 30),
+    ],
+)  # fmt: skip
+def test_the_unit_that_a_data_log_states_for_an_entry_is_its_unit(
+    tmp_path, metadata, radius, factor
+):
+    """The classes SysIdRoutineLog of Java and of C++ write such metadata."""
+    path = tmp_path / "robot.wpilog"
+    names = ("voltage-left-drive", "velocity-left-drive")
+    path.write_bytes(data_log(b"", metadata, SPEED / factor, names))
+    mapping = [f'voltage="{names[0]}" velocity="{names[1]}[1]"{radius}']
+    record = read_records(path, mapping)["motor"]
+    np.testing.assert_allclose(record.velocity, SPEED, rtol=1e-12)
 
 
 def test_of_a_data_log_that_is_cut_off_the_rest_is_read(tmp_path):
