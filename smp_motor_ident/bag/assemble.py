@@ -289,7 +289,10 @@ def _convert(motor: Motor, name: str, signal: mapping.Signal, raw: NDArray[Any])
         if raw.dtype.kind in "iu" and exact:
             return raw.astype(np.int64, copy=False)
         return raw.astype(np.float64) * signal.scale + signal.offset
-    unit = signal.unit or units.check_unit(name, "")
+    plain = signal.scale == 1 and signal.offset == 0 and not motor.plan.own
+    where = signal.topic.rpartition("/")[2] if signal.field == "data" else signal.field
+    named = units.unit_of(name, "", where) if plain else ""
+    unit = signal.unit or named or units.check_unit(name, "")
     values: Array = raw.astype(np.float64)
     values *= signal.scale
     values += signal.offset

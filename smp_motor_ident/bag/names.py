@@ -41,7 +41,7 @@ SPEED_COMMAND = (
 )
 MAY_BE_SUPPLY = r"(?:^|\W|_)v_?in(?:$|\W|_)"
 NO_MOTION = (
-    r"set_?point|target|desired|refer[eê]n[ct]|soll|cmd|command|consign|[\W_]m?v$"
+    r"set_?point|target|desired|autospeed|refer[eê]n[ct]|soll|cmd|command|consign|[\W_]m?v$"
     r"|(?:^|\W|_)(?:erro?r?e?|erreur|fehler|hata|uchyb|ошибка)(?:$|\W|_)"
 )
 HINTS = {

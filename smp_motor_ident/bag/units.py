@@ -78,6 +78,11 @@ _WORDS = {
 }
 """Units by their English names, in the singular."""
 
+_BODY_VECTORS = {
+    "velocity": r"linear\.[xyz]$",  # Twist
+    "position": r"(?:position|translation)\.[xyz]$",  # Pose, Transform
+}
+
 
 def check_unit(signal: str, unit: str) -> str:
     """Return the unit under its usual name, the first of the signal's where none is given."""
@@ -118,8 +123,11 @@ def written_unit(text: str) -> str | None:
 def unit_of(signal: str, written: str, name: str) -> str:
     """Return the unit that a file states for a signal, or else one in the signal's name.
 
-    Empty for SI.  A single letter is not a unit: ``theta_m`` is the motor's angle.
+    Empty for SI.  A single letter is not a unit: ``theta_m`` is the motor's angle.  The vectors of
+    ``geometry_msgs`` are those of a body, in metres.
     """
+    if not written and re.search(_BODY_VECTORS.get(signal, "$^"), name):
+        return "m/s" if signal == "velocity" else "m"
     words = re.split(r"[\W_]+(?:per[\W_]+)?|(?<=[a-z]{2})(?=[A-Z])", name)
     ends = [text for k in range(len(words)) for text in (words[k], "/".join(words[k : k + 2]))]
     for text in [written] if written else ends[::-1]:

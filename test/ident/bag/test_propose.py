@@ -156,6 +156,9 @@ PROPOSED = {
         "voltage=volts position=angle:deg time=t"),
     "a time is no voltage": (1, lambda u, w: dict(t=T, input=1e3 * T, pwm=u, speed=w),
                              "voltage=pwm:pwm velocity=speed time=t"),
+    "a share of the battery is no speed": (
+        1, lambda u, w: dict(time=T, battery=0 * u + 12, autospeed=u / 12, voltage=u, velocity=w),
+        "voltage=voltage velocity=velocity time=time"),
     "a speed command is no voltage": (1, lambda u, w: dict(t=T, speed_cmd=20 * u, u=u, speed=w),
                                       "voltage=u velocity=speed time=t"),
 }  # fmt: skip

@@ -13,6 +13,7 @@ from recordings import (
     RATIO,
     START,
     STATE,
+    TYPES,
     Sent,
     floats,
     header,
@@ -20,6 +21,7 @@ from recordings import (
     joint_state,
     motion,
     notes,
+    serialized,
     write_mcap,
     write_sqlite,
 )
@@ -210,6 +212,36 @@ def test_types_defined_in_the_bag_are_used(tmp_path):
     np.testing.assert_array_equal(record.count, values[:, 1])
     fields = list_topics(path)[0].offers[0].fields
     assert {"wheels[0].speed", "wheels[1].ticks", "flags[2]", "raw[1]"} <= set(fields)
+
+
+@pytest.mark.parametrize(
+    ("signal", "factor"),
+    [
+        ("velocity=/rpm.data", np.pi / 30),
+        ("velocity=/rpm.data:rad/s", 1.0),
+        ("velocity=/rpm.data*2", 2.0),
+    ],
+)
+def test_a_message_whose_name_ends_in_a_unit_is_in_that_unit(tmp_path, signal, factor):
+    values = np.sin(np.arange(50.0))
+    topic = signal.partition("=")[2].partition(".")[0]
+    path = write_mcap(tmp_path / "bag.mcap", in_order(even("/u", values), even(topic, values)))
+    record = read_records(path, [f"voltage=/u.data {signal}"])["motor"]
+    np.testing.assert_allclose(record.velocity, factor * values, rtol=1e-12)
+
+
+def test_the_speed_of_a_body_is_divided_by_the_wheels_radius(tmp_path):
+    """``geometry_msgs/Twist`` and ``Pose`` are in m/s and m (REP 103)."""
+    twist, vector = "geometry_msgs/msg/Twist", TYPES.types["geometry_msgs/msg/Vector3"]
+    values = np.sin(np.arange(50.0))
+    bodies = (serialized(twist, linear=vector(v, 0, 0), angular=vector(0, 0, 0)) for v in values)
+    moved = [Sent("/odom", twist, START + 10**7 * k, body) for k, body in enumerate(bodies)]
+    path = write_mcap(tmp_path / "bag.mcap", in_order(even("/u", values), moved))
+    mapping = ["voltage=/u.data velocity=/odom.linear.x"]
+    with pytest.raises(BagError, match="'m/s' needs wheel_radius"):
+        read_records(path, mapping)
+    record = read_records(path, [*mapping, "wheel_radius=0.05"])["motor"]
+    np.testing.assert_allclose(record.velocity, values / 0.05, rtol=1e-12)
 
 
 def test_a_duty_cycle_times_the_supply_as_it_was_measured(tmp_path):
