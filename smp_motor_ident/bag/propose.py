@@ -395,8 +395,11 @@ def _select_voltage(voltages: list[_Candidate], motions: list[_Candidate]) -> li
     """Return the voltage that explains a motion best, and all motions that it explains.
 
     Of two similar fits, a voltage in volts precedes a duty cycle.  A command without the name of a
-    drive must leave half of the residual, a torque a quarter.
+    drive must leave half of the residual; a torque is taken if nothing else explains a motion.
     """
+    torques = [c for c in voltages if _is_torque(c)]
+    if torques and (others := [c for c in voltages if c not in torques]):
+        return _select_voltage(others, motions) or _select_voltage(torques, motions)
     best: list[_Candidate] = []
     least = np.inf
     for voltage in sorted(voltages, key=lambda c: needs("voltage", c.unit[1:], "supply_voltage")):
@@ -406,7 +409,7 @@ def _select_voltage(voltages: list[_Candidate], motions: list[_Candidate]) -> li
         if not explained:
             continue
         rest = min(rest for _, rest in explained)
-        handicap = 4 if _is_torque(voltage) else 1 if names.drives_by_name(voltage.source) else 2
+        handicap = 1 if names.drives_by_name(voltage.source) else 2
         if handicap * rest * (1 + 1 / voltage.value.size) < least:
             least = handicap * rest
             first = {c.role: c for c, left in reversed(explained) if left < 2 * rest}

@@ -336,6 +336,13 @@ def test_an_effort_is_not_proposed_in_place_of_the_drive(tmp_path, kind, drive):
     assert asked(listing) == ["pwm_full_scale", "supply_voltage"]
 
 
+def test_an_effort_that_explains_the_motion_better_than_a_slow_drive_is_not_proposed(tmp_path):
+    sent = robot("", efforts("current"), 1, "duty")
+    seldom = [s for s in sent if "duty" not in s.topic or s.stamp // 10**7 % 3 == 0]
+    listing = list_topics(write_mcap(tmp_path / "bag.mcap", seldom))[0]
+    assert listing.suggestion[0] == "left.voltage=/duty.data:pwm"
+
+
 def test_an_effort_that_alone_explains_the_motion_is_proposed_with_a_note(tmp_path):
     sent = [s for s in robot("", motor(1)[0], 1) if "pwm" not in s.topic]
     listing = list_topics(write_mcap(tmp_path / "bag.mcap", sent))[0]
