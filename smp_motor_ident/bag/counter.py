@@ -159,7 +159,7 @@ def report_resets(what: str, times: int) -> Finding:
 
 def _estimate_width(count: Integers, steps: Integers, guess: Array) -> int:
     """Return the count at which a counter restarts, estimated from its data; 0 if none."""
-    bits = _width(steps, guess)
+    bits = _width(steps, guess) or _filled_width(count, steps)
     wrap = find_wrap(count.astype(np.float64))
     if wrap is None or (bits and wrap.admits(2.0**bits)):
         return 2**bits if bits else 0
@@ -199,6 +199,13 @@ def _width(steps: Integers, guess: Array) -> int:
         if np.all(np.abs(after) < period / 8) and np.all(np.abs(rest[~large]) < period / 4):
             return bits
     return 0
+
+
+def _filled_width(count: Integers, steps: Integers) -> int:
+    """Return the width that a counter from zero fills with steps of more than half, or 0."""
+    bits = int(count.max()).bit_length()
+    filled = bits >= 7 and count.min() >= 0 and np.ptp(count) > 0.97 * 2**bits
+    return bits if filled and np.mean(np.abs(steps) > 2 ** (bits - 1)) > 0.05 else 0
 
 
 def angle_resets(angle: Array) -> Integers:
