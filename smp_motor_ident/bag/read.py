@@ -145,7 +145,9 @@ def one_line(recording: Recording) -> Iterator[None]:
             yield
     except BagError as error:
         amiss = [f.message for f in recording.findings if f.message not in str(error)]
-        raise BagError("; ".join([str(error), *amiss])) from None
+        text, file = str(error), recording.files[0]
+        where = "" if file.name in text or recording.name in text else f"{file}: "
+        raise BagError("; ".join([where + text, *amiss])) from None
     except _DAMAGE as error:
         reason = (str(error).splitlines() or [""])[0][:200]
         raise BagError(

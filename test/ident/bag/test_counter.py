@@ -360,6 +360,14 @@ def test_counts_that_no_encoder_makes_are_refused(tmp_path):
         read_records(tmp_path / "log.csv", ["voltage=u count=c time=t counts_per_revolution=2000"])
 
 
+def test_a_refusal_of_counts_names_the_file(tmp_path):
+    counts = np.rint(folded(1.5, 15.0, "levels") / (2 * np.pi) * 256).astype(np.int64) % 256
+    rows = (f"{0.01 * k:.2f},{k % 5},{n}" for k, n in enumerate(counts.tolist()))
+    (tmp_path / "log.csv").write_text("\n".join(["t,u,c", *rows]))
+    with pytest.raises(BagError, match=r"log\.csv: the encoder's count turns by more than half"):
+        read_records(tmp_path / "log.csv", ["voltage=u count=c time=t counts_per_revolution=256"])
+
+
 def test_the_roundest_width_is_found_at_once_however_many_are_admitted():
     assert round_to_counts(Wrap(3.1e17, 1e16, 5), 10**9) == 2**58
     assert round_to_counts(Wrap(2.0e17 - 100, 1e14, 5), 10**9) % 1000 == 0
