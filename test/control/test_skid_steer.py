@@ -56,6 +56,8 @@ def test_sides_hold_the_wheels_of_the_contract():
 def test_limiter_lets_nothing_through_that_is_not_finite(bad):
     with pytest.raises(ParameterError, match="finite"):
         SpeedLimiter(max_velocity=1.0).limit(bad, 0.0, 0.0, 0.1)
+    with pytest.raises(ParameterError, match="finite"):
+        SpeedLimiter(max_velocity=1.0).limit(0.0, 0.0, 0.0, bad)
 
 
 @pytest.mark.parametrize(
@@ -73,6 +75,14 @@ def test_limiter_lets_nothing_through_that_is_not_finite(bad):
 def test_limits_with_which_a_body_cannot_stand_are_refused(limits):
     with pytest.raises(ParameterError, match="enclose zero"):
         SpeedLimiter(**limits)
+
+
+@pytest.mark.parametrize(("low", "high"), [(0.0, 1.0), (-1.0, 0.0)])
+def test_a_body_of_one_direction_stands_or_drives(low, high):
+    limiter = SpeedLimiter(min_velocity=low, max_velocity=high)
+    for speed in (-0.5, 0.5):
+        limited = limiter.limit(speed, speed, speed, 0.1).value
+        assert limited == min(max(speed, low), high)
 
 
 def make_odometry(**more: float) -> Odometry:
@@ -149,6 +159,7 @@ def test_heading_hold_follows_a_commanded_turn_across_the_wrap():
 def test_heading_hold_gives_in_when_the_body_is_turned_by_hand():
     hold = HeadingHold(max_error=0.7)
     hold.step(0.0, 0.0, 0.02)
+    assert hold.step(0.0, 0.1, 0.02) < 0.0, "which begins an integral"
     assert hold.step(0.0, 2.0, 0.02) == 0.0
     assert hold.step(0.0, 2.0, 0.02) == 0.0
 

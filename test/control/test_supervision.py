@@ -200,6 +200,8 @@ def test_a_command_that_waited_in_a_queue_takes_no_wheel_but_zero_always_does():
     # The age of a command follows its writer's own clock; without stamps there is no age.
     assert at(6000, 3.0, 50_000, "b") and not at(6600, 3.0, 50_300, "b")
     assert at(7000, 3.0, 0, "c") and at(9000, 3.0, 0, "c")
+    one.set_timeout(0.5)
+    assert at(9500, 3.0, 9500, "c") and at(10_000, 3.0, 9600, "c") and at(10_600, 3.0, 10_500, "a")
 
 
 def test_as_many_writers_are_known_as_a_robot_may_have_and_no_more():
