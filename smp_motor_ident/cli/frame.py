@@ -20,7 +20,9 @@ from smp_motor_control.ros_arguments import split_arguments
 from smp_motor_ident.cli.interruption import check, interruptible
 
 INTERRUPTED = 130  # exit code after Ctrl-C, as shells have it
-TIMEOUT_S = 2.0  # where progress goes to no terminal, a step is named when it has taken so long [s]
+TIMEOUT_S = 2.0  # without a terminal a step is named when it has taken so long [s]
+
+SILENCE_S = 4.0  # and any step is named after so long without a line [s]
 
 
 OF_ROS = "A robot in a namespace: end the line with --ros-args -r __ns:=/robot1."
@@ -149,8 +151,11 @@ def number(low: float, high: float = float("inf")) -> Callable[[str], float]:
 
 
 @contextmanager
-def progress(program: str, quiet: bool = False) -> Iterator[Callable[..., None]]:
-    """Show the progress of long steps as a moving line, or a line each without a terminal."""
+def progress(program: str, quiet: bool = False, takes: str = "") -> Iterator[Callable[..., None]]:
+    """Show the progress of long steps as a moving line, or a line each without a terminal.
+
+    The first of these lines tells the expected duration, ``takes``.
+    """
     if quiet:
         yield lambda text, share=None: None
     elif sys.stderr.isatty():
@@ -163,22 +168,23 @@ def progress(program: str, quiet: bool = False) -> Iterator[Callable[..., None]]
             task = line.add_task("", total=1.0)
             yield lambda text, share=None: line.update(task, description=text, completed=share)
     else:
-        with _lines(program) as say:
+        with _lines(program, takes) as say:
             yield say
 
 
 @contextmanager
-def _lines(program: str) -> Iterator[Callable[..., None]]:
-    """Print each step that is still going on after :data:`TIMEOUT_S`, once."""
+def _lines(program: str, takes: str) -> Iterator[Callable[..., None]]:
+    """Print the present step when it, or the silence, has lasted long."""
     steps: list[tuple[str, float]] = []
     over = threading.Event()
 
     def watch() -> None:
-        printed = 0
+        printed, since, hint = 0, time.monotonic(), f" (usually {takes})" if takes else ""
         while not over.wait(0.25):
-            if len(steps) > printed and time.monotonic() - steps[-1][1] > TIMEOUT_S:
-                printed = len(steps)
-                print(f"{program}: {steps[-1][0]} ...", file=sys.stderr, flush=True)
+            now = time.monotonic()
+            if len(steps) > printed and (now - steps[-1][1] > TIMEOUT_S or now - since > SILENCE_S):
+                print(f"{program}: {steps[-1][0]}{hint} ...", file=sys.stderr, flush=True)
+                printed, since, hint = len(steps), now, ""
 
     watcher = threading.Thread(target=watch, daemon=True)
     watcher.start()

@@ -83,7 +83,7 @@ def work(arguments: argparse.Namespace) -> int:
         return fleet.work(arguments, mapping, fixed)
     paths = [Path(arguments.output) / name for name in OUTPUTS]
     check_free(paths, arguments.force)
-    with frame.progress(NAME, arguments.quiet) as say:
+    with frame.progress(NAME, arguments.quiet, "5 to 30 s for a motor") as say:
         if not arguments.quiet and not any(COMPILED.glob("*.nbi")):
             print(f"{NAME}: compiling for this machine, only this once ...", file=sys.stderr)
         say("reading")

@@ -8,6 +8,8 @@ import os
 import re
 import subprocess
 import sys
+import threading
+import time
 from dataclasses import replace
 from pathlib import Path
 from subprocess import PIPE
@@ -18,7 +20,7 @@ from browser import CHROMIUM, Browser
 from scipy.signal import cont2discrete, lfilter
 
 from smp_motor_control.motor.file import load_motors
-from smp_motor_ident.cli import identification, tune
+from smp_motor_ident.cli import frame, identification, tune
 from smp_motor_ident.cli.identification import OUTPUTS
 from smp_motor_ident.cli.identify import main
 from smp_motor_ident.finding import Finding
@@ -55,6 +57,20 @@ def complaint(capsys: pytest.CaptureFixture[str]) -> str:
     assert lines[0].startswith("identify: ")
     assert "Traceback" not in lines[0]
     return lines[0]
+
+
+def test_many_short_steps_do_not_run_in_silence(capsys, monkeypatch):
+    monkeypatch.setattr(frame, "SILENCE_S", 1.0)
+    said, end = "", time.monotonic() + 20.0
+    with frame.progress("identify", takes="10 s") as say:
+        while said.count("\n") < 2 and time.monotonic() < end:
+            say("fitting friction")
+            threading.Event().wait(0.01)
+            said += capsys.readouterr().err
+    assert said.splitlines()[:2] == [
+        "identify: fitting friction (usually 10 s) ...",
+        "identify: fitting friction ...",
+    ]
 
 
 def test_it_writes_its_three_files_and_recovers_the_motor(recording, tmp_path):
