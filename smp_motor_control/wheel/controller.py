@@ -205,7 +205,10 @@ class WheelController:
             measurement = self.loop.speed(dt, velocity, sample.encoder_count, voltage)
             if self.loop.jumps > before:
                 self._bad_at = now
-                self.refuse("feedback speed that jumps")
+                if self.loop.source == "measured":
+                    self.refuse("feedback speed that jumps")
+                else:
+                    self.refuse("feedback count that jumps")
                 return None
             if not -limit <= measurement <= limit:
                 if measurement == measurement:

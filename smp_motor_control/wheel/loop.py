@@ -179,9 +179,7 @@ class WheelLoop:
         if speed != speed:
             return speed
         resolution = self._one_count(dt)
-        # Jumps of counts are detected elsewhere, without the motor's model.
-        asked = self.profile.target if self.source == "measured" else math.inf
-        if self._plausible.accepts(speed, dt, voltage, resolution, asked):
+        if self._plausible.accepts(speed, dt, voltage, resolution, self.profile.target):
             return speed
         self.jumps += 1
         self._restart()

@@ -3,11 +3,13 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from types import SimpleNamespace
 
 import pytest
+from wheel_world import SETTINGS, SUPPLY, World
 
 from smp_motor_control.encoder import CounterWidth, Encoder
 from smp_motor_control.motor.file import MotorEntry
@@ -107,6 +109,20 @@ def test_a_counter_that_wraps_against_its_description_is_unwrapped(source, windo
     wheel = one.drive(3.0, 10.0)
     assert one.mean == pytest.approx(3.0, rel=0.02) and one.fastest < 3.5
     assert wheel.recovery.failures == 0 and wheel.loop.wraps_at == bits
+
+
+@pytest.mark.parametrize("window", [1, 4])
+def test_a_counter_that_starts_again_at_9000_kicks_no_wheel(window):
+    """hoverboard-firmware-hack-FOC pull request 1: odometry in the range from 0 to 9000."""
+    loop = replace(SETTINGS.loop, speed_source="difference", difference_window=window)
+    world = World(replace(SETTINGS, loop=loop))
+    world.wheel.set_hardware(Gearbox(1.0), Encoder(9000.0), SUPPLY)
+    world.sensor = lambda sample: replace(
+        sample, encoder_count=math.floor(world.angle * 9000.0 / (2 * math.pi)) % 9000
+    )
+    world.run(30.0)
+    assert [abs(speed - 1.5) < 0.05 for _, _, speed in world.log[200:]].count(False) == 0
+    assert world.wheel.refused == {"feedback count that jumps": 7}, "once a turn"
 
 
 def test_steps_that_are_no_wraps_tell_no_width():
