@@ -303,6 +303,7 @@ def _convert(motor: Motor, name: str, signal: mapping.Signal, raw: NDArray[Any])
         "supply_voltage": 1.0 if measured else hardware.supply_voltage,
         "wheel_radius": plan.wheel_radius,
         "pwm_full_scale": plan.pwm_full_scale,
+        "pole_pairs": plan.pole_pairs,
     }
     try:
         values *= units.factor(name, unit, known)

@@ -30,7 +30,7 @@ _CHOICES = {
     "shaft": ("wheel", "motor"),
 }
 _SECONDS = ("gap", "sample_time", "velocity_window")
-_SCALES = ("wheel_radius", "pwm_full_scale")
+_SCALES = ("wheel_radius", "pwm_full_scale", "pole_pairs")
 DEFAULT_MOTOR = "motor"  # name of the motor where a mapping has only one and does not name it
 _NUMBER = r"(?:\d+\.?\d*(?:[eE][+-]?\d+)?|\.\d+(?:[eE][+-]?\d+)?)"
 _PRODUCT = rf"{_NUMBER}(?:\s*[*/]\s*{_NUMBER})*"
@@ -76,6 +76,7 @@ class MotorMap:
     velocity_window: float = 0.0  # [s]; over which the velocity is known to be averaged
     wheel_radius: float = 0.0  # [m]; for velocities and positions of the rim
     pwm_full_scale: float = 0.0  # value of a voltage in ``pwm`` at 100 %; never guessed
+    pole_pairs: float = 0.0  # of a motor whose speed is in electrical revolutions, ``erpm``
     own: bool = False  # whether these are the project's own messages, fully described
 
     @property

@@ -247,6 +247,8 @@ def _required_keys(
         asked["supply_voltage"] = "in volts"
     if any(needs(c.role, c.unit[1:], "wheel_radius") for c in chosen):
         asked["wheel_radius"] = _RADIUS
+    if any(needs(c.role, c.unit[1:], "pole_pairs") for c in chosen):
+        asked["pole_pairs"] = "of the motor, because erpm counts electrical revolutions"
     if any(c.role == "count" or c.unit.startswith(":ticks") for c in chosen):
         asked["counts_per_revolution"] = "of the motor shaft"
     speed = next((c for c in chosen if c.role == "velocity" and not c.unit), None)
@@ -322,7 +324,7 @@ def _fill_placeholders(proposal: Proposal) -> mapping.SignalMap:
     unit = ":ms" if any(text.startswith("time=") for text in proposal.asked) else ""
     given = mapping.parse([i + unit if i.startswith("time=") else i for i in proposal.suggestion])
     hardware = {"supply_voltage": 12.0, "counts_per_revolution": 1.0}
-    some: Any = {"pwm_full_scale": 1e9, "wheel_radius": 1.0, "sample_time": 1.0}
+    some: Any = dict(pwm_full_scale=1e9, wheel_radius=1.0, sample_time=1.0, pole_pairs=1.0)
     motors = {w: replace(one, hardware=hardware, **some) for w, one in given.motors.items()}
     return replace(given, motors=motors)
 

@@ -22,6 +22,7 @@ _DUTY, _RIM, _COUNTS = {"supply_voltage": 1}, {"wheel_radius": -1}, {"counts_per
 _NEEDED = {
     "wheel_radius": "wheel_radius: give --map wheel_radius=METRES",
     "pwm_full_scale": "pwm_full_scale, the value that is 100 %",
+    "pole_pairs": "pole_pairs of the motor, as erpm counts electrical revolutions",
     "supply_voltage": "supply_voltage or a supply signal",
     "counts_per_revolution": "counts_per_revolution",
 }
@@ -34,6 +35,7 @@ _ROWS: tuple[tuple[str, Mapping[str, int], dict[str, float]], ...] = (
     ("current", {}, {"A": 1.0, "mA": 1e-3}),
     ("velocity", {}, {"rad/s": 1.0, "deg/s": _TURN / 360, "rpm": _TURN / 60, "rev/s": _TURN}),
     ("velocity", {}, {"Hz": _TURN, "mrad/s": 1e-3, "rad/min": 1 / 60, "deg/min": _TURN / 21600}),
+    ("velocity", {"pole_pairs": -1}, {"erpm": _TURN / 60}),
     ("velocity", _RIM, {"m/s": 1.0, "mm/s": 1e-3, "cm/s": 1e-2, "km/h": 1 / 3.6}),
     ("velocity", _RIM, {"ft/s": 0.3048, "in/s": 0.0254}),
     ("velocity", _COUNTS, {"ticks/s": _TURN}),

@@ -23,10 +23,11 @@ from numpy.typing import NDArray
 from smp_motor_ident.bag.limits import MAX_COLUMNS, MAX_STRAY_ROW_SHARE
 from smp_motor_ident.bag.readers import grid
 from smp_motor_ident.bag.readers.format import ColumnFile, Format
-from smp_motor_ident.bag.storage import damaged
+from smp_motor_ident.bag.storage import damaged, found
 from smp_motor_ident.bag.units import UNITS, needs, written_unit
 from smp_motor_ident.bag.unpack import Budget
 from smp_motor_ident.errors import BagError
+from smp_motor_ident.finding import Finding
 
 _TESTS = ("slow-forward", "slow-backward", "fast-forward", "fast-backward")
 _ONE_MOTOR = ("Simple", "Arm", "Elevator")
@@ -41,6 +42,7 @@ _FORMS = {
     (False, 10): (*_OLD, *_SIDES, "gyro"),
 }
 """Names of the columns by their number: of SysId, or of its forerunner."""
+_TOLERANCE = 0.01  # of a file's units per rotation
 _DEEPEST = 16
 _WIDEST = 64
 _MOST_CELLS = 5_000_000
@@ -56,14 +58,15 @@ def _open(path: Path, name: str, budget: Budget) -> ColumnFile:
     units: dict[str, str] = {}
     dates: set[str] = set()
     radius = 0.0
+    problems: list[Finding] = []
     if isinstance(document, Mapping) and any(test in document for test in _TESTS):
-        columns, units, radius = _sysid(document, name)
+        columns, units, radius, problems = _sysid(document, name)
     else:
         try:
             columns = dict(islice(_columns("", document, 0, dates), round(MAX_COLUMNS.value) + 1))
         except RecursionError:
             raise BagError(f"{name}: is nested too deeply") from None
-    problems = [damaged(problem)] if problem else []
+    problems += [damaged(problem)] if problem else []
     return ColumnFile(path, name, columns, units, dates, problems, radius)
 
 
@@ -161,11 +164,12 @@ def _flat(prefix: str, row: Any, depth: int) -> Iterator[tuple[str, Any]]:
 
 def _sysid(
     document: Mapping[str, Any], name: str
-) -> tuple[dict[str, NDArray[Any]], dict[str, str], float]:
-    """Return the joined columns of all tests, their units and the wheel's radius.
+) -> tuple[dict[str, NDArray[Any]], dict[str, str], float, list[Finding]]:
+    """Return the joined columns of all tests, their units, the wheel's radius and findings.
 
     With ``unitsPerRotation`` the rows are in rotations (in SysId always, in its forerunner since
-    April 2020), which that number converts to ``units``; otherwise they are in ``units``.
+    April 2020), which that number converts to ``units``; otherwise they are in ``units``.  It is
+    not believed where it contradicts a unit of angle.
     """
     every = chain.from_iterable(document.get(test) or [] for test in _TESTS)
     rows = [row for row in every if isinstance(row, list) and len(row) >= 4]
@@ -185,15 +189,21 @@ def _sysid(
         columns = {k.removeprefix("left_"): c for k, c in columns.items() if "right" not in k}
     unit = written_unit(str(document.get("units", ""))) or ""
     unit = unit if unit in UNITS["position"] else ""
+    rim = needs("position", unit, "wheel_radius")
+    problems = []
+    right = 2 * np.pi / UNITS["position"][unit].factor if unit and not rim else factor
+    if document.get("unitsPerRotation") and abs(factor / right - 1) > _TOLERANCE:
+        text = f"{name}: says {factor:g} {unit} per rotation; {right:g} are taken, correct it"
+        problems.append(found("units_per_rotation", text, "warning", stated=factor))
+        factor = right
     units = {}
     for key in columns:
         what = key.rpartition("_")[2]
         if unit and what in ("position", "velocity"):
             units[key] = unit if what == "position" else f"{unit}/s"
             columns[key] = factor * columns[key]
-    rim = needs("position", unit, "wheel_radius")
     metres = UNITS["position"][unit].factor if rim else 0.0
-    return columns, units, factor * metres / (2 * np.pi)
+    return columns, units, factor * metres / (2 * np.pi), problems
 
 
 def _reason(error: BaseException) -> str:

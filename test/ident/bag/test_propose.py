@@ -230,6 +230,20 @@ def test_a_mapping_of_the_rim_asks_for_the_wheels_radius(tmp_path):
     assert len(read_records(path, [*listing.suggestion, "wheel_radius=0.05"])["motor"]) == N
 
 
+def test_electrical_revolutions_ask_for_the_pole_pairs(tmp_path):
+    """As VESC Tool logs them."""
+    voltage, speed = motor(9)
+    path = write(tmp_path / "log.csv", ms_today=1e3 * T, duty_cycle=voltage / 12, erpm=speed)
+    listing = list_topics(path)[0]
+    assert listing.suggestion[1] == "velocity=erpm:erpm"
+    assert [text.partition("=")[0] for text in listing.asked] == ["supply_voltage", "pole_pairs"]
+    mapping = ["voltage=duty_cycle:duty supply_voltage=12 velocity=erpm time=ms_today:ms"]
+    with pytest.raises(BagError, match="'erpm' needs pole_pairs of the motor"):
+        read_records(path, mapping)
+    record = read_records(path, [*mapping, "pole_pairs=7"])["motor"]
+    np.testing.assert_allclose(record.velocity, speed * np.pi / 30 / 7, rtol=1e-9)
+
+
 @pytest.mark.parametrize(
     ("names", "separator", "suggestion"),
     [

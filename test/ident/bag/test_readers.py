@@ -271,6 +271,19 @@ def test_each_test_of_sysid_is_a_segment(tmp_path):
     assert read_records(path)["motor"].starts == tuple(range(0, N, N // 4))
 
 
+@pytest.mark.parametrize(("units", "wrong"), [("Rotations", 0.471), ("Radians", 1.0)])
+def test_units_per_rotation_that_contradict_the_unit_are_named_and_not_believed(
+    tmp_path, units, wrong
+):
+    """wpilibsuite/sysid issue 319: 1 rotation = 0.471 rotations."""
+    path = tmp_path / "sysid.json"
+    sysid(path, [TIME, VOLTAGE, TURNS, RATE], units=units, unitsPerRotation=wrong)
+    record = read_records(path)["motor"]
+    np.testing.assert_allclose(record.velocity, SPEED, rtol=1e-12)
+    (finding,) = (f for f in record.findings if f.code == "units_per_rotation")
+    assert finding.severity == "warning" and f"says {wrong:g}" in finding.message
+
+
 def drivetrain(path: Path) -> Path:
     """Write a SysId file of a drivetrain whose wheels have a radius of 50 mm."""
     sides = [VOLTAGE, -VOLTAGE, TURNS, -TURNS, RATE, -RATE]
