@@ -146,6 +146,12 @@ def _check(motor: Motor, series: dict[str, Series]) -> None:
             "its sign; it was left out"
         )
         motor.tell("unsigned_current", text, "warning")
+    ways = [series[name].value for name in ("position", "count") if name in series]
+    moved = any(np.nan_to_num(np.diff(way)).any() for way in ways)
+    if moved and "velocity" in series and not np.nan_to_num(series["velocity"].value).any():
+        del series["velocity"]
+        text = "velocity: it is 0 while the motor turns: its driver does not fill it in"
+        motor.tell("velocity_not_filled", f"{text}; it was left out", "warning")
 
 
 def _clock(motor: Motor) -> dict[str, Integers]:

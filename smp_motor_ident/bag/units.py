@@ -4,7 +4,7 @@
 import math
 import re
 from collections.abc import Mapping
-from itertools import product
+from itertools import pairwise, product, zip_longest
 from typing import NamedTuple
 
 from smp_motor_ident.errors import BagError
@@ -74,7 +74,7 @@ _ALIASES = {
 }
 
 _WORDS = {
-    **{"rotation": "rev", "turn": "rev", "radian": "rad", "degree": "deg"},
+    **{"rotation": "rev", "rot": "rev", "turn": "rev", "radian": "rad", "degree": "deg"},
     **{"meter": "m", "metre": "m", "foot": "ft", "feet": "ft", "inch": "in", "inche": "in"},
     **{"amp": "A", "second": "s", "sec": "s", "minute": "min", "hour": "h"},
 }
@@ -112,14 +112,18 @@ def written_unit(text: str) -> str | None:
     """
     if text.strip() in ("", "-", "1", "."):
         return ""
-    parts = re.split(r"[\s_]per[\s_]|/", text.strip().lower())
-    words = "/".join(_WORDS.get(part.strip().removesuffix("s"), part) for part in parts)
-    for signal, form in product(UNITS, (text, words)):
+    for signal, form in product(UNITS, (text, _abbreviate(text))):
         try:
             return check_unit(signal, form)
         except BagError:
             continue
     return None
+
+
+def _abbreviate(text: str) -> str:
+    """Return the symbol of a unit in words."""
+    parts = re.split(r"[\s_]per[\s_]|/", text.strip().lower())
+    return "/".join(_WORDS.get(part.strip().removesuffix("s"), part) for part in parts)
 
 
 def unit_of(signal: str, written: str, name: str) -> str:
@@ -131,7 +135,9 @@ def unit_of(signal: str, written: str, name: str) -> str:
     if not written and re.search(_BODY_VECTORS.get(signal, "$^"), name):
         return "m/s" if signal == "velocity" else "m"
     words = re.split(r"[\W_]+(?:per[\W_]+)?|(?<=[a-z]{2})(?=[A-Z])", name)
-    ends = [text for k in range(len(words)) for text in (words[k], "/".join(words[k : k + 2]))]
+    words = [word for word in words if word.lower() != "per"]
+    pairs = [_abbreviate("/".join(two)) for two in pairwise(words)]
+    ends = [text for both in zip_longest(words, pairs, fillvalue="") for text in both]
     for text in [written] if written else ends[::-1]:
         try:
             unit = check_unit(signal, text) if written or len(text) > 1 else ""

@@ -193,7 +193,7 @@ def _sysid(
     problems = []
     right = 2 * np.pi / UNITS["position"][unit].factor if unit and not rim else factor
     if document.get("unitsPerRotation") and abs(factor / right - 1) > _TOLERANCE:
-        text = f"{name}: says {factor:g} {unit} per rotation; {right:g} are taken, correct it"
+        text = f"{name}: says {factor:g} {unit} per rotation, which has {right:g}; correct it"
         problems.append(found("units_per_rotation", text, "warning", stated=factor))
         factor = right
     units = {}

@@ -221,3 +221,13 @@ def test_a_speed_command_mapped_as_a_voltage_is_told(tmp_path, field, severity):
     record = read(tmp_path / "bag.mcap", sent, [f"voltage={field} velocity=/w.data"])
     found = [f.severity for f in record.findings if f.code == "speed_command"]
     assert found == ([] if severity is None else [severity])
+
+
+@pytest.mark.parametrize("still", [False, True])
+def test_a_velocity_that_is_never_filled_in_is_left_out(tmp_path, still):
+    """UbiquityRobotics/ubiquity_motor issue 59: the position moves, the velocity is 0."""
+    angle = np.zeros(N) if still else 0.01 * np.cumsum(motion())
+    path = write(tmp_path / "log.csv", t=T, u=U, p=angle, w=0 * angle)
+    record = read_records(path, ["voltage=u position=p velocity=w time=t"])["motor"]
+    assert (record.velocity is None) is not still
+    assert ("velocity_not_filled" in codes(record)) is not still

@@ -220,6 +220,9 @@ def test_types_defined_in_the_bag_are_used(tmp_path):
         ("velocity=/rpm.data", np.pi / 30),
         ("velocity=/rpm.data:rad/s", 1.0),
         ("velocity=/rpm.data*2", 2.0),
+        ("velocity=/vel_turns_s.data", 2 * np.pi),
+        ("velocity=/VelocityRotationsPerSec.data", 2 * np.pi),
+        ("velocity=/VelocityRadPerSec.data", 1.0),
     ],
 )
 def test_a_message_whose_name_ends_in_a_unit_is_in_that_unit(tmp_path, signal, factor):
