@@ -119,7 +119,7 @@ def descend(
         expected = float(taken @ (2 * linear.gradient - linear.normal @ taken))
         fold = _longest_fold(at, taken)
         place = data, trial, scales, settled(start, linear, taken), noise
-        near = expected < NEAR * linear.cost and fold < NEAR_FOLD
+        near = 0 <= expected < NEAR * linear.cost and fold < NEAR_FOLD
         following = _simulate_step(place, linear, near)
         gained = linear.cost - following.cost
         least = converged * min(linear.cost / linear.row.size, 1.0)
@@ -133,7 +133,8 @@ def descend(
                 continue
         elif linear.exact:
             damping = max(damping * 10, 1e-2)
-            if damping > MOST_DAMPING or expected < ROUGHNESS * least:
+            # A step that a bound cut short may promise a loss; a shorter one does not.
+            if damping > MOST_DAMPING or 0 <= expected < ROUGHNESS * least:
                 break
             continue
         elif expected < least:

@@ -289,7 +289,7 @@ def _with_current(data: Data, found: Fit) -> Fit:
     found = replace(found, scales=data.scales(found.scales.lag))
     ok = np.isfinite(data.current)
     y = data.current[ok]
-    best: tuple[float, Chain] | None = None
+    starts: list[tuple[float, Chain]] = []
     for sensor in CURRENT_SENSORS:
         for start in sensor.starts(found.scales) or ({},):
             chain = found.chain.with_component(MOTORS[2], {"ln_r": 0.0})
@@ -300,13 +300,19 @@ def _with_current(data: Data, found: Fit) -> Fit:
             design = np.column_stack([drive[ok, 0], np.ones(y.size)])
             (slope, offset), *_ = np.linalg.lstsq(design, y, rcond=None)
             rest = float(np.square(y - design @ (slope, offset)).sum())
-            if slope > 0 and (best is None or rest < best[0]):
+            if slope > 0:
                 at = {"ln_r": -math.log(slope), "current_offset": float(offset)}
-                best = rest, chain.with_values(at)
-    if best is None:
+                starts.append((rest, chain.with_values(at)))
+    if not starts:
         raise CurrentError("the current does not follow from voltage and motion")
-    begun = approach(data, best[1], found.scales, found.initial, SEARCH_ORDER)
-    return fit(data, begun, 2, SEARCH_ORDER, ROUGH)
+    starts.sort(key=lambda one: one[0])
+    # The plain sensor, too: others make up for a motor that the motion alone tells badly.
+    plain = [chain for _, chain in starts if chain.has("current")]
+    tried = {chain.codes: chain for chain in (starts[0][1], *plain)}
+    begun = [
+        approach(data, chain, found.scales, found.initial, SEARCH_ORDER) for chain in tried.values()
+    ]
+    return fit(data, min(begun, key=lambda f: f.deviance), 2, SEARCH_ORDER, ROUGH)
 
 
 def fit_roughly(data: Data, chain: Chain, like: Fit) -> Fit:
