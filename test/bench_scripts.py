@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The scripts of the folder benchmarks, as modules."""
 
-from __future__ import annotations
-
 import importlib
 import sys
 from pathlib import Path

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Peer of skid_steer in tests: it sends commands and feedback, and stores its messages."""
 
-from __future__ import annotations
-
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
 from domain_node import DomainNode

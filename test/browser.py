@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Headless Chromium as a test drives it: over a pipe, by its own protocol, without a network."""
 
-from __future__ import annotations
-
 import base64
 import itertools
 import json
@@ -12,7 +10,6 @@ import shutil
 import subprocess
 import time
 from pathlib import Path
-from types import TracebackType
 from typing import Any
 
 CHROMIUM = next(
@@ -51,7 +48,7 @@ class Browser:
         self.complaints: list[str] = []
         self.requests: list[str] = []
 
-    def __enter__(self) -> Browser:
+    def __enter__(self):
         target = self._page()
         attached = self.ask("Target.attachToTarget", targetId=target, flatten=True)
         self._session = attached["sessionId"]
@@ -59,12 +56,7 @@ class Browser:
             self.ask(f"{domain}.enable")
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, kind, error, trace):
         self._process.kill()
         self._process.wait()
         os.close(self._out)

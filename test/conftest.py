@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Fixtures for every test: a ROS domain of its own, and real processes that cannot outlive it."""
 
-from __future__ import annotations
-
 import contextlib
 import fcntl
 import os
@@ -180,9 +178,7 @@ def process(tmp_path: Path, ros_domain: int) -> Iterator[Callable[..., TestProce
     """
     started: list[TestProcess] = []
 
-    def start(
-        *command: str | Path, env: dict[str, str] | None = None, cwd: Path | None = None
-    ) -> TestProcess:
+    def start(*command, env=None, cwd=None):
         started.append(TestProcess([str(part) for part in command], env, cwd or tmp_path))
         return started[-1]
 
@@ -208,12 +204,7 @@ def eventually() -> Callable[..., None]:
     something happens compares stamps instead.
     """
 
-    def poll(
-        condition: Callable[[], object],
-        deadline: float = 10.0,
-        step: Callable[[], object] | None = None,
-        message: str = "",
-    ) -> None:
+    def poll(condition, deadline=10.0, step=None, message=""):
         end = time.monotonic() + deadline + BUSY
         while not condition():
             if time.monotonic() > end:

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """A node of a test in its own ROS domain, spun by the test."""
 
-from __future__ import annotations
-
 import time
 
 import rclpy

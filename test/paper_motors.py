@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The motors of the paper's Table 1."""
 
-from __future__ import annotations
-
 from smp_motor_control.motor import MotorParameters
 
 TABLE_1 = {
@@ -14,9 +12,7 @@ TABLE_1 = {
 """R [ohm], L [H], K [V s/rad], J [kg m^2], b [N m s/rad]."""
 
 
-def paper_motor(
-    wheel: str, static_voltage: float = 0.0, inductance: float | None = None
-) -> MotorParameters:
+def paper_motor(wheel, static_voltage=0.0, inductance=None):
     """Return a motor of the table with Coulomb friction, perhaps with another inductance."""
     R, L, K, J, b = TABLE_1[wheel]
     return MotorParameters(

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Pages that print results: what they show against a fresh run."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterable
 

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Benchmarks, which no other test runs, import what there is, and nothing private."""
 
-from __future__ import annotations
-
 import ast
 import importlib
 from collections.abc import Iterator

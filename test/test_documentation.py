@@ -6,8 +6,6 @@ something else: its first line names it.  ``output`` is printed by the fence bef
 ``python`` of a tutorial runs in order.
 """
 
-from __future__ import annotations
-
 import json
 import math
 import re

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The documentation as its readers meet it: one index, every page within a telephone's width."""
 
-from __future__ import annotations
-
 import re
 import subprocess
 import sys

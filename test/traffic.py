@@ -1,10 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Topics and bags for the tests of record and play."""
 
-from __future__ import annotations
-
 import time
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -63,9 +60,7 @@ def contents(bag: Path) -> dict[str, list[bytes]]:
     return found
 
 
-def publish_steadily(
-    publishers: list[Any], count: int, rate: float, make: Callable[[int], Any] = state
-) -> list[bytes]:
+def publish_steadily(publishers, count, rate, make=state):
     """Publish at a rate; catch up after delays, and skip nothing."""
     sent = []
     begin = time.monotonic()

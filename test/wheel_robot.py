@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Peer of nodes in tests: it sends set-points and feedback, and stores the messages."""
 
-from __future__ import annotations
-
 import copy
 import math
 import time
@@ -48,7 +46,7 @@ def two_wheeled(folder: Path) -> tuple[Path, Path]:
 class Relay:
     """Passes one wheel's feedback on, as it is or with a fault."""
 
-    def __init__(self, robot: WheelRobot, wheel: str) -> None:
+    def __init__(self, robot, wheel):
         self.robot = robot
         self.fault: Callable[[MotorState], Sequence[MotorState]] = lambda message: [message]
         self.delayed: list[tuple[float, MotorState]] = []

@@ -1,20 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
 """One wheel in open and closed loop without ROS, made of the parts that run on the robot."""
 
-from __future__ import annotations
-
 import math
 import random
 from collections.abc import Callable
 from dataclasses import dataclass, fields
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from smp_motor_control.motor.file import MotorEntry
-from smp_motor_control.motor.hardware import DrivenMotor, DriveSettings, Sample, Supply
-from smp_motor_control.wheel.loop import LoopSettings, WheelLoop
+from smp_motor_control.motor.hardware import DrivenMotor, DriveSettings, Sample
+from smp_motor_control.wheel.loop import WheelLoop
 
 Array = NDArray[np.float64]
 
@@ -88,21 +84,13 @@ Answer = Callable[[float, float, Sample], tuple[float, tuple[float, float, float
 """From time, interval and sample to the command, and set-point, reference and measurement."""
 
 
-def simulate_open_loop(
-    entry: MotorEntry, voltage: Callable[[float], float], duration: float, **world: Any
-) -> Run:
+def simulate_open_loop(entry, voltage, duration, **world):
     """Drive a motor with a voltage."""
     nothing = 0.0, 0.0, math.nan
     return _simulate(entry, lambda time, dt, sample: (voltage(time), nothing), duration, **world)
 
 
-def simulate_closed_loop(
-    entry: MotorEntry,
-    settings: LoopSettings,
-    setpoint: Callable[[float], float],
-    duration: float,
-    **world: Any,
-) -> Run:
+def simulate_closed_loop(entry, settings, setpoint, duration, **world):
     """Let a wheel's loop follow set-points."""
     limit = 1.5 * entry.supply_voltage
     loop = WheelLoop(
@@ -120,17 +108,7 @@ def simulate_closed_loop(
     return _simulate(entry, answer, duration, **world)
 
 
-def _simulate(
-    entry: MotorEntry,
-    answer: Answer,
-    duration: float,
-    *,
-    timing: Timing | None = None,
-    drive: DriveSettings | None = None,
-    load: Callable[[float], float] | None = None,
-    supply: Supply | None = None,
-    seed: int = 0,
-) -> Run:
+def _simulate(entry, answer, duration, *, timing=None, drive=None, load=None, supply=None, seed=0):
     timing = timing or Timing()
     drive = drive or DriveSettings(command_timeout=math.inf)
     plant = DrivenMotor(entry, drive, supply, seed=seed)

@@ -4,8 +4,6 @@
 The motor is the tests' own: first order, 0.36 rad/s per volt at the wheel, 50 ms; 100 Hz.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -70,7 +68,7 @@ class World:
             self.held = self.held if voltage is None else voltage
         self.log.append((self.now, self.held, self.speed))
 
-    def run(self, seconds: float) -> World:
+    def run(self, seconds):
         for _ in range(round(seconds / DT)):
             self.step()
         return self

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Acceptance of gains: refusals with their reasons, and driving with accepted gains."""
 
-from __future__ import annotations
-
 import math
 import random
 from dataclasses import fields, replace

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """No motor and no period ends a running loop."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np
@@ -63,9 +61,7 @@ def model_based_settings(model: MotorModel, supply: float, bandwidth: float) -> 
     )
 
 
-def drive_a_wheel(
-    settings: LoopSettings, entry: MotorEntry, dt: float, setpoint: float, steps: int = STEPS
-) -> float:
+def drive_a_wheel(settings, entry, dt, setpoint, steps=STEPS):
     """Run a loop on its motor; return the largest voltage that it asked for."""
     plant = DrivenMotor(entry, DriveSettings(command_timeout=math.inf))
     loop = WheelLoop(

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Time-out of a velocity command (behaviour_cases of diff_drive_cases.json)."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The URDF moves with joint_states, for any number of wheels."""
 
-from __future__ import annotations
-
 from xml.etree import ElementTree
 
 import pytest

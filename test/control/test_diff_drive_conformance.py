@@ -5,8 +5,6 @@ The behaviour of the running node on time-outs, stamps and NaN: test_body_comman
 core, test/nodes/test_skid_steer.py through the real process.
 """
 
-from __future__ import annotations
-
 import json
 import math
 from pathlib import Path

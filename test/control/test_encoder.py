@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Counts from angles, rollover of counters of any width, speed from counts."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Excitation: bounded, never in step with the sampling, and rich."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Every limit of the fault detection to the sample; steps of 1/64 s, so that sums are exact."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable
 from dataclasses import asdict, replace
@@ -23,9 +21,7 @@ WINDOW = 16  # samples in a third of the tracking time
 ABOVE = 1.0 + 2.0**-30
 
 
-def found(
-    samples: Iterable[tuple[float, float, float]], limits: FaultLimits = LIMITS, detector=None
-) -> tuple[int, Fault | None]:
+def found(samples, limits=LIMITS, detector=None):
     """Return the first of (V, rad/s, A), counted from 1, with a fault, and the fault."""
     detector = detector or FaultDetector(limits)
     for k, sample in enumerate(samples, 1):
@@ -111,9 +107,7 @@ def test_a_reset_clears_the_counts(sample):
     assert found(repeat(sample, 99), detector=detector) == (first, fault)
 
 
-def followed(
-    *parts: tuple, limits: FaultLimits = LIMITS, kv: float = math.nan, static: float = 0.0
-):
+def followed(*parts, limits=LIMITS, kv=math.nan, static=0.0):
     """Return the first window with a fault, from 1; parts: reference, speed, V, saturated."""
     detector = FaultDetector(limits)
     detector.volts_per_speed, detector.static_voltage = kv, static

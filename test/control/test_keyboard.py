@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Keys to speeds, and the dead man's switch."""
 
-from __future__ import annotations
-
 import pytest
 
 from smp_motor_control import WHEELS

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The motor compared with an independent integrator, and its friction."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Reading of motor files, and messages for invalid ones."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

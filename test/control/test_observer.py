@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The speed observer against the exact motor and counts as an encoder gives them."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np
@@ -38,14 +36,7 @@ def volts(t: float) -> float:
     return 6.0 + 2.0 * math.sin(8.3 * t) + 1.0 * math.sin(2.0 * math.pi * 0.31 * t)
 
 
-def errors_of(
-    p: MotorParameters,
-    observer: SpeedObserver,
-    dt: float,
-    duration: float = 2.0,
-    load: float = 0.0,
-    jitter: float = 0.0,
-) -> tuple[np.ndarray, np.ndarray]:
+def errors_of(p, observer, dt, duration=2.0, load=0.0, jitter=0.0):
     """Errors of the observer and of differenced counts after the first 0.5 s [rad/s]."""
     rng = np.random.default_rng(3)
     motor, differenced = Motor(p), DifferencedSpeed(ENCODER)

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Odometry step by step against the arc and the covariance written down once more."""
 
-from __future__ import annotations
-
 import math
 import random
 

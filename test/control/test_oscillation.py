@@ -1,11 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Sustained oscillations of a wheel are reported, and nothing else is."""
 
-from __future__ import annotations
-
 import math
 import random
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -39,15 +36,9 @@ def p_alone(p: float) -> WheelSettings:
 
 
 def drive(
-    settings: WheelSettings,
-    rate: float,
-    target: Callable[[float], float] = lambda t: 1.5,
-    noise: float = 0.0,
-    seconds: float = 8.0,
-    seed: int = 0,
-    motor: str = "front_left",
-    latch: bool = True,
-) -> tuple[float, WheelController]:
+    settings, rate, target=lambda t: 1.5, noise=0.0, seconds=8.0, seed=0, motor="front_left",
+    latch=True,
+):  # fmt: skip
     """Drive one of the paper's motors; return when a swing was found [s], and the controller."""
     entry, draw = load_motors(CONFIG / "motors_paper.yaml")[motor], random.Random(seed)
     wheel = WheelController(settings)

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The PID controller beyond the conformance cases."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

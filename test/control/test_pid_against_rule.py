@@ -5,8 +5,6 @@ The rule is that of its class ``Pid`` (branch jazzy, commit 05de3c67): error in,
 the integral advanced after the command, a given rate of the error not remembered.
 """
 
-from __future__ import annotations
-
 import math
 import random
 

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Every case of test/data/conformance/pid_cases.json, to its stated tolerance."""
 
-from __future__ import annotations
-
 import json
 import math
 from pathlib import Path

@@ -5,8 +5,6 @@ e = r - y,   P = p (b r - y),   D = d f(c r - y)',   F = kv r + ka a + ks sign(r
 unsaturated = P + I + D + F,   output = its clamp,   I += dt (i e + anti-windup), clamped
 """
 
-from __future__ import annotations
-
 import math
 import random
 

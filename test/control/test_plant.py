@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The driven motor: commands when they arrive, voltage as it was, sensors as they are."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from pathlib import Path

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Limits that end a test of a motor."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Numbers that no robot has are refused by their name, wherever they are given."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator
 

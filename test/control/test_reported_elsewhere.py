@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Faults reported by users of other wheel drivers, with their sources."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace

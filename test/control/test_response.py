@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The exact response against the matrix exponential, from oscillation to a pole long decayed."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy.linalg import expm

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Loops made of the parts that run on the robot: speed sources, references, limits."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Kinematics, odometry and limits beyond the conformance cases."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

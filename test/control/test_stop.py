@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """A wheel stands within ``stop_time`` of a zero set-point or of silence, whatever its settings."""
 
-from __future__ import annotations
-
 import math
 import random
 from dataclasses import replace

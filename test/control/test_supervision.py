@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Freshness of feedback, leases, faults of motors, and recovery."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The table of faults in the documentation names existing tests, and the whole matrix."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The fault matrix of one wheel, event by event, with the time passed in."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from itertools import pairwise

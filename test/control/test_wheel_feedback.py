@@ -1,10 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Travel from lost, late, wrong and unequal samples of wheels."""
 
-from __future__ import annotations
-
 import math
-from collections.abc import Callable
 
 import pytest
 
@@ -17,9 +14,7 @@ def make() -> WheelFeedback:
     return WheelFeedback(("a", "b"), ("c", "d"), max_speed=100.0)
 
 
-def feed(
-    feedback: WheelFeedback, t: float, wheels: str, position: float, velocity=0.0, now=None
-) -> None:
+def feed(feedback, t, wheels, position, velocity=0.0, now=None):
     for wheel in wheels:
         feedback.receive(wheel, WheelSample(t, position, velocity), t if now is None else now)
 
@@ -120,11 +115,8 @@ RATE, MOST = 200, 11.6
 
 
 def drive(
-    see: Callable[[str, float, WheelSample], WheelSample | None],
-    seconds: float = 6.0,
-    ways: Callable[[str, float], float] = lambda wheel, t: (1.0 if wheel in "ab" else 2.0) * t,
-    wheels: tuple[str, str] = ("ab", "cd"),
-) -> tuple[float, float, WheelFeedback]:
+    see, seconds=6.0, ways=lambda wheel, t: (1.0 if wheel in "ab" else 2.0) * t, wheels=("ab", "cd")
+):
     """Drive 2 s on after ``seconds`` with a fault; return the ways of the sides [rad]."""
     feedback = WheelFeedback(*wheels, max_speed=MOST)
     left = right = 0.0

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The limits of a wheel's controller to the sample; steps of 1/64 s, so that times are exact."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, replace
 

@@ -4,8 +4,6 @@
 Steps of 1/64 s, so that times are exact; the speeds are counted out by the tests.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """A drive as it was identified, and the answer of a true one by an integration of our own."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """A motor of its own for the tests: fixed small steps, shares nothing with the estimator."""
 
-from __future__ import annotations
-
 import numba
 import numpy as np
 from paper_motors import TABLE_1  # noqa: F401

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Recordings of known motors for the tests of estimation."""
 
-from __future__ import annotations
-
 import independent
 import numpy as np
 
@@ -31,18 +29,18 @@ def truth(wheel: str, static_voltage: float) -> dict[str, float]:
 
 
 def record(
-    wheel: str = "rear_left",
+    wheel="rear_left",
     *,
-    current: bool = True,
-    static_voltage: float = 0.3,
-    kinds: tuple[str, ...] = ("sine", "square", "fourier"),
-    seconds: float = 5.0,
-    rate: float = 200.0,
-    amplitude: float = 10.0,
-    torque_noise: float = 0.0,
-    seed: int = 0,
-    voltage: np.ndarray | None = None,
-) -> Record:
+    current=True,
+    static_voltage=0.3,
+    kinds=("sine", "square", "fourier"),
+    seconds=5.0,
+    rate=200.0,
+    amplitude=10.0,
+    torque_noise=0.0,
+    seed=0,
+    voltage=None,
+):
     """Return counts, differenced speed and noisy current of a motor of Table 1."""
     rng = np.random.default_rng(seed)
     n = int(seconds * rate)

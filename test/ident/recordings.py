@@ -1,10 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Recordings made by libraries other than the reader under test: rosbags, mcap, sqlite3."""
 
-from __future__ import annotations
-
 import sqlite3
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -112,9 +110,7 @@ class Motion:
         return sent
 
 
-def motion(
-    n: int = 200, wheel: str = "front_left", step: int = 10_000_000, seed: int = 1, bits: int = 0
-) -> Motion:
+def motion(n=200, wheel="front_left", step=10000000, seed=1, bits=0):
     """Return a motor that follows a random voltage."""
     rng = np.random.default_rng(seed)
     voltage = rng.uniform(-12, 12, n)
@@ -161,15 +157,8 @@ def definition(type_name: str) -> str:
 
 
 def write_mcap(
-    path: Path,
-    messages: Iterable[Sent],
-    *,
-    defined: bool = True,
-    encode: Callable[[bytes], bytes] = bytes,
-    profile: str = "ros2",
-    finish: bool = True,
-    **options: Any,
-) -> Path:
+    path, messages, *, defined=True, encode=bytes, profile="ros2", finish=True, **options
+):
     """Write an .mcap file with the mcap library."""
     options.setdefault("chunk_size", 4096)
     options.setdefault("compression", mcap.writer.CompressionType.NONE)
@@ -197,14 +186,7 @@ TOPIC_COLUMNS = {
 }
 
 
-def write_sqlite(
-    path: Path,
-    messages: Iterable[Sent],
-    *,
-    schema: int = 4,
-    encode: Callable[[bytes], bytes] = bytes,
-    qos: str = "",
-) -> Path:
+def write_sqlite(path, messages, *, schema=4, encode=bytes, qos=""):
     """Write a .db3 file as rosbag2 laid it out in that version of its schema."""
     database = sqlite3.connect(path)
     database.execute(
@@ -250,16 +232,16 @@ def write_sqlite(
 
 
 def write_metadata(
-    folder: Path,
-    files: list[str],
-    messages: list[Sent],
+    folder,
+    files,
+    messages,
     *,
-    version: int = 9,
-    storage: str = "mcap",
-    compression: tuple[str, str] = ("", ""),
-    counts: dict[str, int] | None = None,
-    qos: Any = None,
-) -> None:
+    version=9,
+    storage="mcap",
+    compression=("", ""),
+    counts=None,
+    qos=None,
+):
     """Write a metadata.yaml as rosbag2 of that version did."""
     topics: dict[tuple[str, str], int] = {}
     for sent in messages:

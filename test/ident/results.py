@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """A result of identification as the tests of reports and documents need it."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from smp_motor_ident.finding import Finding

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The pages for people who see little or use no mouse: judged by axe-core in a browser."""
 
-from __future__ import annotations
-
 import json
 from importlib.util import find_spec
 from pathlib import Path

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Samples that are stamped alike count as one, and the user hears of it."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import motors

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Commands that take effect at instants that scatter are noticed, and the intervals cover them."""
 
-from __future__ import annotations
-
 import independent
 import motors
 import numpy as np

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The page of a commissioning in a browser: first view, numbers and widths."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from pathlib import Path

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The plan of a commissioning, before anything moves."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 import shutil
@@ -45,7 +43,7 @@ def test_a_dry_run_prints_and_draws_the_plan_and_touches_nothing(tmp_path, capsy
 class Client:
     """Of a robot that is there and whose wheels report."""
 
-    def __enter__(self) -> Client:
+    def __enter__(self):
         return self
 
     def __exit__(self, *_: object) -> None:

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """A commissioning that is cut off and gone on with ends with the numbers of one that is not."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 import math

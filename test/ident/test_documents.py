@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Documents of results: they read back, spoilt ones are named, files appear all or none."""
 
-from __future__ import annotations
-
 import json
 import os
 from collections.abc import Iterator

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Changes of set-point in a recorded drive: found by segment, read as the design states them."""
 
-from __future__ import annotations
-
 import json
 import math
 from dataclasses import replace

@@ -104,9 +104,7 @@ def test_the_tail_of_a_filter_is_not_edge_timed():
 
 
 @pytest.mark.parametrize("per_turn", [60, 150, 400])
-def test_friction_is_found_with_an_edge_timer_in_fast_reversals(
-    per_turn,
-):
+def test_friction_is_found_with_an_edge_timer_in_fast_reversals(per_turn):
     """Where it passes zero, a reading is late by up to a row or two, and nearly none elsewhere."""
     volts = np.repeat(np.tile([3.0, -3.0], 25), 60)
     speed, angle = motion(volts)

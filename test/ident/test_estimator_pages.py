@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The pages on the estimator against the code: functions, effects, quantities and output."""
 
-from __future__ import annotations
-
 import ast
 import re
 from decimal import Decimal

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Of a long recording stretches are used."""
 
-from __future__ import annotations
-
 import motors
 import numpy as np
 

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Findings have codes, and every threshold is in one table."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 from dataclasses import replace

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Many recordings: each by itself, kept once it is known, compared in one table."""
 
-from __future__ import annotations
-
 import csv
 import os
 import re

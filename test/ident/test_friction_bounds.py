@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """What feed-forward may take for known of dry friction, by the interval that the estimate gives."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

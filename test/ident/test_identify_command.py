@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The tool ``identify`` as its user meets it: files, exit codes, one-line complaints."""
 
-from __future__ import annotations
-
 import json
 import os
 import re

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Ctrl-C reaches a tool even when Python drops the exception."""
 
-from __future__ import annotations
-
 import argparse
 import contextlib
 import os

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """A loop that is known gives its commands back from set-points and speeds alone."""
 
-from __future__ import annotations
-
 import json
 import math
 from pathlib import Path

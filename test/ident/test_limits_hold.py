@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Limits of the answer that no other test shows, through `estimate` alone."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import motors

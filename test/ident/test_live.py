@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The live window: its samples, its record, and its conditions for an estimate."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -18,9 +16,7 @@ SECOND = 1_000_000_000
 NOW = 10**9 * SECOND
 
 
-def state(
-    voltage: float, current: float, velocity: float, position: float, count: int
-) -> SimpleNamespace:
+def state(voltage, current, velocity, position, count):
     return SimpleNamespace(
         voltage=voltage, current=current, velocity=velocity, position=position, encoder_count=count
     )

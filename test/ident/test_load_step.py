@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """A load that comes or goes while a motor is recorded hides none of its numbers."""
 
-from __future__ import annotations
-
 import independent
 import motors
 import numpy as np
@@ -15,9 +13,7 @@ RATE, SECONDS, WINDOW, STATIC = 500, 16, 10, 0.4
 R, L, K, J, B = independent.TABLE_1["rear_left"]
 
 
-def recorded(
-    load: np.ndarray, *, counts: bool, seed: int, least: float = -9.0, back: float = SECONDS
-) -> Record:
+def recorded(load, *, counts, seed, least=-9.0, back=SECONDS):
     """Return a motor under a load [of its friction], its speed a mean over ten rows, or counts.
 
     From ``back`` [s] on it is driven the other way.

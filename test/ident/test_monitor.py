@@ -1,10 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The monitor of a commissioned motor, on signals of a simulator of this file's own."""
 
-from __future__ import annotations
-
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -68,12 +66,7 @@ def driving(seconds: float, rng: np.random.Generator) -> Iterator[float]:
         yield volts
 
 
-def followed(
-    seconds: float,
-    change: Callable[[Motor, float], bool] = lambda motor, time: False,
-    bad_day: bool = False,
-    seed: int = 1,
-) -> Iterator[tuple[float, Monitor]]:
+def followed(seconds, change=lambda motor, time: False, bad_day=False, seed=1):
     """Drive, and yield time and monitor every second."""
     rng = np.random.default_rng(seed)
     monitor, motor, count = Monitor(MOTOR), Motor(), 0

@@ -21,9 +21,7 @@ TRUTH = {
 
 
 @cache
-def _motion(
-    kind: str, seconds: float, rate: float = 500.0
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _motion(kind, seconds, rate=500.0):
     """Return time, voltage, and the motor's current, speed and angle."""
     t = np.arange(int(seconds * rate)) / rate
     v = excitation(t, kind, 9.0)

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """A Record refuses what cannot be one motor's signals, and names it."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

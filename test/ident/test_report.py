@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The report: a page that stands alone, drawings and words of the same numbers."""
 
-from __future__ import annotations
-
 import json
 import math
 import re

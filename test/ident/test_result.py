@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """An Estimate survives its file, and its draws follow its covariance."""
 
-from __future__ import annotations
-
 import pytest
 from results import PHYSICAL, estimate
 

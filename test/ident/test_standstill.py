@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """A standing encoder repeats one error; taken for news it would make intervals too narrow."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

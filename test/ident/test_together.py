@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The claim of benchmarks/together.py in small: four unlike wheels arrive together."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Gains for a speed that is made of an angle with noise of its own, with counts and without."""
 
-from __future__ import annotations
-
 import json
 import math
 from dataclasses import replace

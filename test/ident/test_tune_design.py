@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """design, compare and the wheels together: units, robustness, refusals."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

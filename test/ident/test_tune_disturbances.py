@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Gains and bands account for disturbances of the recording: loads, jitter, outliers, rounding."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Exported gains keep their stated properties in the target's own arithmetic."""
 
-from __future__ import annotations
-
 import json
 import math
 from dataclasses import replace

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Every tuning method: its published numbers, and its specification on the sampled loop."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Designed gains on the loop that runs: the wheel's own controller on the simulated hardware."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path

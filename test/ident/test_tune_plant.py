@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The sampled motor, its margins and its simulation, against simulators that share no code."""
 
-from __future__ import annotations
-
 import math
 
 import control

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The observer in the loop, and the choice of where the speed comes from."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Gains keep their margins on the identified drive, with its sensor, friction and uncertainty."""
 
-from __future__ import annotations
-
 import json
 import math
 from dataclasses import replace

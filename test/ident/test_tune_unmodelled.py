@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Gains tolerate the unmodelled dynamics that a recording does not exclude."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import control

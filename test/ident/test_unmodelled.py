@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Model error of the response by frequency, with its confidence region."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """A run that no fit has seen, judged by the errors of the fit."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from smp_motor_ident.commission.validation_run import Simulated, judge

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """A drive on new gains compared with its prediction."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -11,7 +9,7 @@ import numpy as np
 import pytest
 from wheel_simulation import Timing, simulate_closed_loop
 
-from smp_motor_control.motor.file import MotorEntry, load_motors
+from smp_motor_control.motor.file import load_motors
 from smp_motor_control.motor.hardware import DriveSettings
 from smp_motor_control.motor.parameters import MotorParameters
 from smp_motor_ident.cli.tuning import read_estimates
@@ -31,14 +29,7 @@ def designed() -> Design:
     return design(ESTIMATE, Loop(sample_time=STEP, supply_voltage=12.0))
 
 
-def drive(
-    one: Design,
-    entry: MotorEntry = ENTRY,
-    load: float = 0.0,
-    late: float = 0.0,
-    wait: float = 0.0,
-    offset: float = 0.0,
-) -> v.Change:
+def drive(one, entry=ENTRY, load=0.0, late=0.0, wait=0.0, offset=0.0):
     """Return a change of set-point that another motor did, as commission reads it."""
     document = {"sample_time": STEP, "delay": STEP, "supply_voltage": 12.0}
     setpoint = one.specification.change / one.loop.gear_ratio

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The checks before a commissioning: results of a short test of the wheels, and findings."""
 
-from __future__ import annotations
-
 import itertools
 import math
 from dataclasses import replace
@@ -27,13 +25,7 @@ HARDWARE = Hardware(gear_ratio=RATIO, counts_per_revolution=COUNTS, supply_volta
 LEVELS = (1.2, 2.4, 4.8)
 
 
-def trace(
-    sign: float = 1.0,
-    velocity_scale: float = 1.0,
-    applied: float = 1.0,
-    dead: float = 0.0,
-    driven: bool = True,
-) -> tuple[Trace, list[Phase]]:
+def trace(sign=1.0, velocity_scale=1.0, applied=1.0, dead=0.0, driven=True):
     """Return a test of a motor of first order with friction: ramp, three levels, coast, both ways.
 
     The motor is integrated here, by Euler steps of a fiftieth of its time constant.

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """A winding's temperature between two recordings of a commissioning."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
