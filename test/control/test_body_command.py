@@ -15,45 +15,28 @@ def test_nothing_is_asked_before_the_first_command_even_if_that_is_nan():
     assert command.at(0.0) is None
 
 
-def test_command_brakes_after_the_timeout_and_not_before():
-    command = BodyCommand(0.5)
-    assert command.receive(1.0, 0.0, 0.0, 10.0) is Verdict.ACCEPTED
-    assert command.at(10.5) == (1.0, 0.0)
-    assert command.at(10.501) == (0.0, 0.0)
-    command.receive(1.0, 0.0, 0.0, 11.0)
-    assert command.at(11.0) == (1.0, 0.0)
+DRIVES, STOPS = (1.0, 0.0), (0.0, 0.0)
 
 
-def test_timeout_of_zero_lets_a_command_hold():
-    command = BodyCommand(0.0)
-    command.receive(1.0, 0.0, 100.0, 1.0)
-    assert command.at(11.0) == (1.0, 0.0)
-
-
-def test_zero_stamp_is_taken_as_now():
-    command = BodyCommand(0.5)
-    assert command.receive(1.0, 0.0, None, 10.0) is Verdict.ZERO_STAMP
-    assert command.at(10.4) == (1.0, 0.0)
-
-
-@pytest.mark.parametrize(("age", "accepted"), [(0.499, True), (0.5, False), (3.0, False)])
-def test_stale_command_is_dropped_on_arrival(age, accepted):
-    command = BodyCommand(0.5)
-    verdict = command.receive(1.0, 0.0, age, 10.0)
-    assert (verdict is Verdict.ACCEPTED) == accepted
-    assert (command.at(10.0) is not None) == accepted
-
-
-def test_age_on_arrival_counts_for_the_timeout():
-    command = BodyCommand(0.5)
-    command.receive(1.0, 0.0, 0.4, 10.0)
-    assert command.at(10.11) == (0.0, 0.0)
-
-
-def test_stamp_from_the_future_does_not_hold_any_longer():
-    command = BodyCommand(0.5)
-    command.receive(1.0, 0.0, -3600.0, 10.0)
-    assert command.at(10.51) == (0.0, 0.0)
+@pytest.mark.parametrize(
+    ("timeout", "age", "verdict", "asked"),
+    [
+        (0.5, 0.0, Verdict.ACCEPTED, {10.5: DRIVES, 10.501: STOPS}),
+        (0.0, 100.0, Verdict.ACCEPTED, {20.0: DRIVES}),  # no time-out
+        (0.5, None, Verdict.ZERO_STAMP, {10.4: DRIVES}),
+        (0.5, 0.499, Verdict.ACCEPTED, {10.0: DRIVES}),
+        (0.5, 0.5, Verdict.STALE, {10.0: None}),
+        (0.5, 3.0, Verdict.STALE, {10.0: None}),
+        (0.5, 0.4, Verdict.ACCEPTED, {10.11: STOPS}),
+        (0.5, -3600.0, Verdict.ACCEPTED, {10.51: STOPS}),  # a stamp from the future
+    ],
+)
+def test_command_of_an_age_holds_until_its_timeout(timeout, age, verdict, asked):
+    command = BodyCommand(timeout)
+    assert command.receive(*DRIVES, age, 10.0) is verdict
+    assert {at: command.at(at) for at in asked} == asked
+    command.receive(*DRIVES, 0.0, 11.0)
+    assert command.at(11.0) == DRIVES
 
 
 @pytest.mark.parametrize("bad", [(math.nan, 0.0), (0.0, math.inf), (-math.inf, math.nan)])

@@ -67,7 +67,6 @@ def test_the_papers_gains_at_50_hz_swing_and_are_named_without_a_model():
     found, wheel = drive(settings, 50.0)
     swing = wheel.oscillation.found
     assert found < 2.0 and wheel.state is State.DRIVING
-    assert swing is not None
     # Peak to peak over 4 rad/s of the true speed, in eight samples a cycle.
     assert swing.amplitude == pytest.approx(2.0, abs=0.4)
     assert swing.frequency == pytest.approx(6.1, abs=0.4)
@@ -127,7 +126,6 @@ def test_a_swing_is_over_when_its_gains_are():
     swings = Oscillation()
     for k in range(400):
         swings.add(0.01, 1.0, 1.0 + 0.8 * math.sin(40.0 * 0.01 * k))
-    assert swings.found is not None
     assert swings.found.amplitude == pytest.approx(0.8, abs=0.02)
     assert swings.found.frequency == pytest.approx(40.0 / (2 * math.pi), rel=0.02)
     for _ in range(400):

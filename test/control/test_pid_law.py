@@ -7,6 +7,7 @@ unsaturated = P + I + D + F,   output = its clamp,   I += dt (i e + anti-windup)
 
 import math
 import random
+from dataclasses import replace
 
 import pytest
 
@@ -90,13 +91,21 @@ def drawn_gains(draw: random.Random) -> PidGains:
     )  # fmt: skip
 
 
-@pytest.mark.parametrize("seed", range(6))
-def test_every_term_of_random_controllers_follows_the_law(seed):
+PUBLISHED = dict(
+    setpoint_weight_p=1.0, setpoint_weight_d=1.0, derivative_filter_time_constant=0.0,
+    feedforward_static=0.0, feedforward_velocity=0.0, feedforward_acceleration=0.0,
+)  # fmt: skip
+"""With these the law is the published rule of control_toolbox's ``Pid`` (jazzy, 05de3c67)."""
+
+
+@pytest.mark.parametrize("fixed", [{}, PUBLISHED], ids=["law", "published rule"])
+@pytest.mark.parametrize("seed", range(10))
+def test_every_term_of_random_controllers_follows_the_law(seed, fixed):
     draw = random.Random(seed)
-    for _ in range(30):
-        gains = drawn_gains(draw)
+    for _ in range(20):
+        gains = replace(drawn_gains(draw), **fixed)
         law, pid = Law(gains), Pid(gains)
-        for _ in range(30):
+        for _ in range(40):
             r, y = draw.choice([0.0, draw.uniform(-5.0, 5.0)]), draw.uniform(-5.0, 5.0)
             dt, a = draw.uniform(1e-3, 0.05), draw.choice([0.0, draw.uniform(-20.0, 20.0)])
             rate = draw.choice([None, None, draw.uniform(-50.0, 50.0)])

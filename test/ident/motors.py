@@ -3,6 +3,7 @@
 
 import independent
 import numpy as np
+from scipy.signal import lfilter
 
 from smp_motor_ident.record import Hardware, Record
 
@@ -26,6 +27,25 @@ def truth(wheel: str, static_voltage: float) -> dict[str, float]:
         "time_constant_product": el * j / a0,
         "static_voltage": static_voltage,
     }
+
+
+def check(found, truth, names=None, *, sigmas=4.0, floor=0.0, most=None, total=False):
+    """Assert that quantities are within so many standard deviations of the truth.
+
+    ``floor`` is an additional error and ``most`` the largest deviation, relative to the truth;
+    with ``total`` the deviations include systematic uncertainty.
+    """
+    for name in names or truth:
+        q, true = found.parameters.get(name) or found.combinations[name], truth[name]
+        std = q.total_std if total else q.std
+        assert abs(q.value - true) < sigmas * std + floor * abs(true), (name, q, true)
+        assert most is None or std < most * abs(true), (name, q, true)
+
+
+def first_order(voltage, gain, tau, step):
+    """Return the exact speed, from rest, under voltages that ran before their rows."""
+    keep = np.exp(-step / tau)
+    return np.r_[0.0, lfilter([1 - keep], [1.0, -keep], gain * voltage[1:])]
 
 
 def record(

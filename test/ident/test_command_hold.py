@@ -4,7 +4,7 @@
 import numpy as np
 import pytest
 from independent import TABLE_1, excitation, simulate
-from motors import truth
+from motors import check, truth
 from scipy.signal import lsim
 
 from smp_motor_ident.estimate import estimate
@@ -44,9 +44,7 @@ def test_a_motor_that_answers_before_its_command_was_read_an_interval_late(curre
     found = estimate(Record("motor", t, late, amps, count=count, hardware=Hardware(1.0, 500.0)))
     assert not found.unreliable
     assert found.value("delay") == pytest.approx(-0.01, abs=3e-4)
-    for name in ("dc_gain", "time_constant", "static_voltage"):
-        q = found.combinations[name]
-        assert abs(q.value - TRUTH[name]) < 4 * q.std and q.std < 0.02 * TRUTH[name]
+    check(found, TRUTH, ("dc_gain", "time_constant", "static_voltage"), most=0.02)
 
 
 @pytest.mark.parametrize("kind", ["square", "fourier", "sine"])
@@ -186,7 +184,5 @@ def test_a_delay_just_beyond_a_whole_sample_is_not_given_to_the_winding(late):
     motor = 0.188, 1.76e-4, 0.018, 3.9e-4, 1.8e-4, 0.07
     record = late_counts(rng, v, 200, 500.0, late, motor, 0.13)
     found = estimate(record)
-    delay, winding = found.combinations["delay"], found.parameters["inductance"]
     # 4 standard deviations: one in 16,000; the kink hid a tenth of a sample, and doubled L.
-    assert abs(delay.value - late / 10 / 200) < 4 * delay.total_std
-    assert abs(winding.value - 1.76e-4) < 4 * winding.total_std
+    check(found, {"delay": late / 10 / 200, "inductance": 1.76e-4}, total=True)

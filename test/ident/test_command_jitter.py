@@ -32,16 +32,12 @@ def recorded(latest: float, seed: int) -> Record:
 
 def test_the_scatter_of_commands_is_covered():
     for found in (estimate(recorded(1.0, seed)) for seed in range(3)):
-        true = motors.truth("rear_left", 0.0)
-        for name in ("dc_gain", "time_constant", "time_constant_product"):
-            quantity = found.combinations[name]
-            assert quantity.value is not None and quantity.total_std is not None
-            assert abs(quantity.value - true[name]) < 3.5 * quantity.total_std, name
+        names = ("dc_gain", "time_constant", "time_constant_product")
+        motors.check(found, motors.truth("rear_left", 0.0), names, sigmas=3.5, total=True)
 
 
 def test_a_delay_that_is_declared_stays_so_under_scatter():
     found = estimate(recorded(1.0, 0), fixed={"delay": 0.5 / RATE})
     assert found.combinations["delay"].value == 0.5 / RATE
-    lag = found.combinations["time_constant"]
-    assert lag.value is not None and lag.total_std is not None
-    assert abs(lag.value - motors.truth("rear_left", 0.0)["time_constant"]) < 3.5 * lag.total_std
+    truth = motors.truth("rear_left", 0.0)
+    motors.check(found, truth, ["time_constant"], sigmas=3.5, total=True)

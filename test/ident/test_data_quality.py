@@ -203,8 +203,7 @@ def test_a_speed_of_few_counts_is_explained_as_closely_as_counts_let_it():
     found = estimate(coarse)  # a count more or less is 157 rad/s of at most 300
     assert found.fit_percent.estimation < 70  # below which a speed is said to be ill explained
     assert not found.unreliable
-    gain, true = found.combinations["dc_gain"], motors.truth("rear_left", 0.3)["dc_gain"]
-    assert abs(gain.value - true) < 4 * gain.std
+    motors.check(found, motors.truth("rear_left", 0.3), ["dc_gain"])
 
 
 def test_a_speed_of_few_counts_of_another_motor_is_refused():

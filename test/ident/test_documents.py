@@ -58,7 +58,7 @@ def test_any_document_is_read_or_refused_in_one_line(tmp_path, junk):
     whole = json.dumps(identification_document({"w": estimate()}))
 
     def places(node: object, way: tuple[str | int, ...] = ()) -> Iterator[tuple[str | int, ...]]:
-        items = node.items() if isinstance(node, dict) else enumerate(node)  # type: ignore[call-overload]
+        items = node.items() if isinstance(node, dict) else enumerate(node)
         for key, value in items:
             yield (*way, key)
             if isinstance(value, (dict, list)):

@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from motors import check
 
 from smp_motor_ident.estimate import estimate
 from smp_motor_ident.quality.edge_timer import between_edges, held_of
@@ -66,9 +67,7 @@ def test_values_held_by_an_edge_timer_are_not_a_dead_zone(tick, per_turn):
     assert said.evidence["count"] == pytest.approx(COUNT, rel=0.25)  # by how it is held: to a row
     found = estimate(record)
     assert "dead_zone" not in found.combinations and not found.unreliable
-    for name, true in (("dc_gain", GAIN), ("static_voltage", STATIC)):
-        q = found.combinations[name]
-        assert abs(q.value - true) < 4 * q.std and q.std < 0.25 * true
+    check(found, {"dc_gain": GAIN, "static_voltage": STATIC}, most=0.25)
 
 
 def test_a_rounded_or_held_speed_from_counts_is_not_edge_timed():
@@ -114,7 +113,4 @@ def test_friction_is_found_with_an_edge_timer_in_fast_reversals(per_turn):
     true = speed[round(STEP / FINE) - 1 :: round(STEP / FINE)]
     late, off = shown - true, between_edges(record).velocity - true
     assert np.nanmean(off**2) < 0.1 * np.mean(late**2)  # a third of the size
-    found = estimate(record)
-    for name, value in (("dc_gain", GAIN), ("static_voltage", STATIC)):
-        q = found.combinations[name]
-        assert abs(q.value - value) < 4 * q.std, name
+    check(estimate(record), {"dc_gain": GAIN, "static_voltage": STATIC})

@@ -39,11 +39,8 @@ def test_records_share_the_rows_by_their_length_and_short_ones_stay_whole() -> N
 
 def test_the_stretches_of_a_long_record_tell_its_motor() -> None:
     found = estimate(excerpts([motors.record(seconds=20.0, current=False)], 4_000))
-    truth = motors.truth("rear_left", 0.3)
-    for name in ("dc_gain", "time_constant", "time_constant_product", "static_voltage"):
-        quantity = found.combinations[name]
-        assert quantity.value is not None and quantity.std is not None
-        assert abs(quantity.value - truth[name]) < SIGMAS * quantity.std
+    names = ("dc_gain", "time_constant", "time_constant_product", "static_voltage")
+    motors.check(found, motors.truth("rear_left", 0.3), names, sigmas=SIGMAS)
 
 
 def test_identify_uses_and_shows_stretches_of_a_long_record() -> None:
@@ -51,14 +48,9 @@ def test_identify_uses_and_shows_stretches_of_a_long_record() -> None:
     rng = np.random.default_rng(0)
     time = 0.001 * np.arange(rows)
     voltage = np.repeat(rng.uniform(-6.0, 6.0, rows // 100), 100)
-    speed = np.zeros(rows)
-    keep = np.exp(-0.001 / 0.06)
-    for k in range(1, rows):
-        speed[k] = keep * speed[k - 1] + (1 - keep) * 25.0 * voltage[k]
+    speed = motors.first_order(voltage, 25.0, 0.06, 0.001)
     record = Record("motor", time, voltage, velocity=speed + rng.normal(0.0, 0.5, rows))
     outcome = identify_wheel([record], (), "auto", {}, lambda _: None)
-    assert outcome.estimate is not None
     assert [f.code for f in outcome.estimate.findings].count("excerpt") == 1
-    gain = outcome.estimate.combinations["dc_gain"]
-    assert abs(gain.value - 25.0) < SIGMAS * gain.std
+    motors.check(outcome.estimate, {"dc_gain": 25.0}, sigmas=SIGMAS)
     assert len(outcome.comparisons) == STRETCHES

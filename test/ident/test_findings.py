@@ -51,7 +51,6 @@ def test_clean_data_have_no_finding_beyond_a_note():
 def test_the_curves_agree_with_the_verdict():
     result = estimate(motors.record("rear_left", seconds=8.0))
     curve = result.residuals.autocorrelation
-    assert curve is not None
     inside = bool(np.all(np.abs(curve.value[1:]) < curve.band))
     assert result.residuals.white == inside
     assert curve.value[0] == pytest.approx(1.0, abs=1e-12)  # by definition, but for rounding
@@ -91,7 +90,6 @@ def test_a_motor_that_rings_has_a_winding_and_no_filter():
 @pytest.mark.parametrize(("scale", "severity"), [(1.0, "note"), (1.3, "unreliable")])
 def test_a_current_whose_scale_an_ohmmeter_shows(scale, severity):
     made = motors.record("rear_left", seconds=3.0)
-    assert made.current is not None
     ohm = motors.truth("rear_left", 0.3)["resistance"]
     measured = replace(
         made, current=scale * made.current, hardware=replace(made.hardware, resistance=ohm)

@@ -42,7 +42,7 @@ def test_a_motor_that_drifts_is_told_from_those_that_do_not():
     # 0.1 % a day is 3 % in 30 days, known to 30 * 0.2 % / sqrt(82.5): the days' sum of squares.
     change, deviation = re.match(
         r"changes by (-[\d.]+) ± ([\d.]+) % in 30 days", mark.text
-    ).groups()  # type: ignore[union-attr]
+    ).groups()
     assert float(deviation) == pytest.approx(0.66, abs=0.01)
     assert float(change) == pytest.approx(-3.0, abs=3 * 0.66)
     assert "4.6 standard deviations over 10 recordings in 9 days" in mark.text

@@ -112,7 +112,7 @@ def test_terminal_json_and_page_state_the_same_numbers(recording, tmp_path, caps
         text = page[words.label(name)]
         # Label and number are on one line of the terminal, separated by spaces only.
         assert re.search(rf"{words.label(name)} +{re.escape(text)} ", terminal)
-        value, std, unit = re.fullmatch(r"([\d.]+) ± ([\d.]+) (\S+)", text).groups()  # type: ignore[union-attr]
+        value, std, unit = re.fullmatch(r"([\d.]+) ± ([\d.]+) (\S+)", text).groups()
         digit = 10.0 ** -len(value.partition(".")[2])  # of the last decimal
         for written, kept in ((value, "value"), (std, "std")):
             stated = motor["combinations"][name][kept] / UNITS.get(unit, 1.0)
@@ -228,8 +228,8 @@ def test_another_recording_judges_the_model(recording, tmp_path):
 def test_the_executable_complains_without_a_traceback(process, tmp_path):
     (tmp_path / "not_a_bag.mcap").write_bytes(b"not a bag at all")
     tool = process("identify", "not_a_bag.mcap", "--output", "result")
-    assert tool.wait(60.0) == 2  # type: ignore[attr-defined]
-    lines = tool.output.strip().splitlines()  # type: ignore[attr-defined]
+    assert tool.wait(60.0) == 2
+    lines = tool.output.strip().splitlines()
     assert len(lines) == 1
     assert "not_a_bag.mcap" in lines[0]
     assert not (tmp_path / "result").exists()
@@ -237,7 +237,7 @@ def test_the_executable_complains_without_a_traceback(process, tmp_path):
 
 def found(severity: str) -> Estimate:
     """Return an estimate whose data show a dead zone."""
-    finding = Finding("dead_zone", severity, "a dead zone of 1 V", {}, "record a slow ramp")  # type: ignore[arg-type]
+    finding = Finding("dead_zone", severity, "a dead zone of 1 V", {}, "record a slow ramp")
     known = {"dc_gain": Quantity(25.0, 0.1, (24.8, 25.2), "rad/s/V")}
     chain = ChainRecord(("first_order", "speed"), {"ln_a0": -3.2, "ln_a1": -6.0})
     return Estimate("motor", "first_order", {}, known, findings=(finding,), chain=chain)
@@ -273,10 +273,8 @@ def test_a_reader_that_has_gone_does_not_change_the_answer(recording, tmp_path):
     tool = subprocess.Popen(
         [*command, "--output", str(tmp_path / "result")], stdout=subprocess.PIPE, stderr=PIPE
     )
-    assert tool.stdout is not None
     tool.stdout.close()
     assert tool.wait(120.0) == 0
-    assert tool.stderr is not None
     assert b"Error" not in tool.stderr.read()
     assert (tmp_path / "result" / "report.html").is_file()
 

@@ -19,14 +19,12 @@ def share_of(quantity: Quantity, cause: str) -> Share | None:
 def test_scale_error_of_a_current_is_within_the_systematic_uncertainty(scale):
     # 4 %: the tolerance that a Hall sensor is sold with.
     made = motors.record("rear_left", seconds=3.0)
-    assert made.current is not None
     truth = motors.truth("rear_left", 0.3)
     found = estimate(replace(made, current=scale * made.current)).parameters
     for name in ("resistance", "inertia", "coulomb_friction"):
         value, low, high = found[name].value, *(found[name].total_ci95 or (np.nan, np.nan))
         assert low < truth[name] < high
         share = share_of(found[name], "current_scale")
-        assert share is not None and value is not None
         assert share.size == pytest.approx(0.03 * value)
         # The scale is no scatter: the random interval does not reach the truth.
         assert abs(value - truth[name]) > NORMAL_95 * (found[name].std or 0.0)
@@ -48,7 +46,6 @@ def test_gain_at_one_amplitude_is_sharp_and_states_where_it_holds():
     assert gain.std is not None and gain.std < 0.005 * gain.value
     assert gain.valid == {"voltage": (-10.0, 10.0)}
     one_size = share_of(gain, "one_size_of_voltage")
-    assert one_size is not None and one_size.share is not None
     assert 0.02 < one_size.share < 0.5
     # A voltmeter ten times as good as the assumed bridge leaves a tenth of it.
     meter = replace(made, hardware=replace(made.hardware, voltage_accuracy=0.01))

@@ -46,21 +46,15 @@ def test_a_load_that_steps_is_found_and_moves_no_number(counts, at):
     assert abs(words.evidence["load_step_at"] * SECONDS - at) < 0.06 * SECONDS
     true = motors.truth("rear_left", STATIC)
     assert not found.unreliable
-    for name in ("dc_gain", "static_voltage", *(() if counts else ("resistance", "inductance"))):
-        quantity = {**found.combinations, **found.parameters}[name]
-        # the simulator's own steps leave parts in a thousand
-        assert abs(quantity.value - true[name]) < 4 * quantity.std + 2e-3 * true[name]
-        assert quantity.std < 0.05 * true[name]
+    names = ["dc_gain", "static_voltage", *(() if counts else ("resistance", "inductance"))]
+    motors.check(found, true, names, floor=2e-3, most=0.05)  # the simulator's steps: 1e-3
 
 
-@pytest.mark.parametrize(
-    ("counts", "back"), [(False, SECONDS), (True, SECONDS), (True, 9.4)]
-)  # fmt: skip
+@pytest.mark.parametrize(("counts", "back"), [(False, SECONDS), (True, SECONDS), (True, 9.4)])
 def test_of_a_motor_that_turns_one_way_the_friction_is_not_told_from_loads(counts, back):
     """In one direction all the time, or reversed from the left-out part of the load on."""
     found = estimate(recorded(stepped(9.3), counts=counts, seed=5, least=3.0, back=back))
-    gain, true = found.combinations["dc_gain"], motors.truth("rear_left", STATIC)["dc_gain"]
-    assert abs(gain.value - true) < 4 * gain.std + 2e-3 * true
+    motors.check(found, motors.truth("rear_left", STATIC), ["dc_gain"], floor=2e-3)
 
 
 def test_no_load_is_not_a_step():

@@ -58,19 +58,13 @@ def test_friction_that_delays_the_first_motion_is_in_the_lags_of_one_step():
     record = motors.record(
         "rear_left", current=False, voltage=step, kinds=("x",), rate=1000.0, static_voltage=0.6
     )
-    found, true = estimate(record).combinations, motors.truth("rear_left", 0.6)
-    for name in ("time_constant", "time_constant_product"):
-        q = found[name]
-        assert abs(q.value - true[name]) < 4 * q.total_std, name
-        assert q.total_std < 0.5 * true[name], name
+    lags = ("time_constant", "time_constant_product")
+    motors.check(estimate(record), motors.truth("rear_left", 0.6), lags, total=True, most=0.5)
 
 
 def test_two_levels_know_gain_and_friction_apart():
     found = estimate(_record(np.r_[np.zeros(100), np.full(400, 8.0), np.full(400, 4.0)]))
-    for name in ("dc_gain", "static_voltage"):
-        q = found.combinations[name]
-        assert q.value is not None, name
-        assert abs(q.value - TRUTH[name]) < 4 * q.std, name
+    motors.check(found, TRUTH, ("dc_gain", "static_voltage"))
     assert "steady_speed" not in found.combinations
     # One way only: a load as large as half of the friction would have been friction, too.
     assert "one_direction" in [f.code for f in found.findings if f.severity == "warning"]
@@ -190,9 +184,8 @@ def test_the_rounding_of_counts_hides_no_step():
     hardware = Hardware(1.0, 64.0, 0, 9.0, None)
     voltage = np.r_[0.0, np.full(t.size - 1, 6.9)]
     found = estimate(Record("motor", t, voltage, count=count, hardware=hardware))
-    lag = found.combinations["time_constant"]
-    assert abs(lag.value - tau) < 5 * lag.std  # 5 standard deviations: one in 1.7 million
-    assert lag.std < 0.1 * tau
+    # 5 standard deviations: one in 1.7 million
+    motors.check(found, {"time_constant": tau}, sigmas=5.0, most=0.1)
     assert not found.unreliable
 
 
@@ -213,10 +206,8 @@ def test_a_load_does_not_hide_the_order():
     position = np.array(out[::fine]) + 1e-3 * rng.standard_normal(v.size)
     held = np.r_[0.0, v[:-1]]  # what ran up to each row
     found = estimate(Record("motor", t[::fine], held, position=position))
-    for name, true in (("dc_gain", gain), ("static_voltage", friction)):
-        q = found.combinations[name]
-        # 4 standard deviations (one in 16,000), plus the error of the test's grid
-        assert abs(q.value - true) < 4 * q.std + 2e-3 * true, name
+    # 4 standard deviations (one in 16,000), plus the error of the test's grid
+    motors.check(found, {"dc_gain": gain, "static_voltage": friction}, floor=2e-3)
 
 
 @pytest.mark.parametrize(("second_tone", "said"), [(0.0, True), (2.0, False)])
@@ -240,10 +231,8 @@ def test_an_offset_of_the_current_may_be_a_drop_of_the_driver_where_the_motor_tu
     current = out[:, 0] + 0.004 * rng.standard_normal(t.size)
     angle = out[:, 2] + 1e-3 * rng.standard_normal(t.size)
     found = estimate(Record("motor", t, v + drop, current, position=angle))
-    q = found.parameters["coulomb_friction"]
-    std = q.total_std
     # 5 standard deviations count as a silent error.
-    assert abs(q.value - tc) < 5 * std
+    motors.check(found, {"coulomb_friction": tc}, sigmas=5.0, total=True)
 
 
 @pytest.mark.parametrize("sharp", [False, True])

@@ -32,7 +32,7 @@ def comparison(role: str, n: int = 4000) -> Comparison:
     time = np.arange(n) * 0.005
     voltage = 8 * np.sign(np.sin(2 * np.pi * 0.37 * time))
     speed = 25 * voltage
-    return Comparison(role, "bag", time, voltage, speed + rng.normal(0, 2, n), speed)  # type: ignore[arg-type]
+    return Comparison(role, "bag", time, voltage, speed + rng.normal(0, 2, n), speed)
 
 
 class Outside(HTMLParser):
@@ -192,7 +192,6 @@ def test_sliders_of_the_tuning_page_choose_designs_that_tune_has_made(tmp_path, 
     loop = Loop(sample_time=0.005, gear_ratio=65.5, counts_per_revolution=500, supply_voltage=12.0)
     tuning = tuning_page.tuning_of(estimate(), loop, design(estimate(), loop))
     soft, own = tuning.choices
-    assert soft.design is not None and own.design is not None
     assert tuning.chosen == 1
     crossovers = [one.design.margins.crossover for one in (soft, own) if one.design]
     # A design at a bandwidth keeps it to the 5 % that the method allows itself.

@@ -52,7 +52,7 @@ def drive() -> list[Comparison]:
         voltage = 8 * np.sign(np.sin(2 * np.pi * 0.37 * time))
         speed = 25 * voltage
         noisy = speed + rng.normal(0, 2, time.size)
-        parts.append(Comparison(role, "bag", time, voltage, noisy, speed))  # type: ignore[arg-type]
+        parts.append(Comparison(role, "bag", time, voltage, noisy, speed))
     return parts
 
 

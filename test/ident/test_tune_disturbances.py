@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from drives import LOOP, MOTOR, TRUE, change, estimate, overshoot
+from motors import first_order
 
 from smp_motor_control.wheel.loop import WheelLoop
 from smp_motor_ident.cli import tuning
@@ -124,10 +125,7 @@ def test_noise_of_a_recorded_speed_limits_the_gains():
     rng = np.random.default_rng(4)
     T, n, noise = 0.002, 6000, 6.0
     voltage = np.repeat(rng.uniform(-10.0, 10.0, n // 60), 60)
-    speed = np.zeros(n)
-    decay = math.exp(-T / MOTOR["time_constant"])
-    for k in range(1, n):
-        speed[k] = decay * speed[k - 1] + (1 - decay) * MOTOR["dc_gain"] * voltage[k]
+    speed = first_order(voltage, MOTOR["dc_gain"], MOTOR["time_constant"], T)
     shown = speed + noise * rng.standard_normal(n)
     record = Record("m", T * np.arange(n), voltage, None, shown, None, None)
     found = identify(replace(record, hardware=Hardware(1.0, None, 0, 12.0)))
@@ -160,10 +158,7 @@ def test_no_settling_is_stated_for_a_speed_rounded_beyond_its_band():
     assert math.isfinite(fine.specification.settling.high)
     rng, T = np.random.default_rng(8), 0.01
     voltage = np.repeat(rng.uniform(-10.0, 10.0, 60), 30)
-    speed = np.zeros(voltage.size)
-    decay = math.exp(-T / MOTOR["time_constant"])
-    for k in range(1, speed.size):
-        speed[k] = decay * speed[k - 1] + (1 - decay) * MOTOR["dc_gain"] * voltage[k]
+    speed = first_order(voltage, MOTOR["dc_gain"], MOTOR["time_constant"], T)
     shown = Record("m", T * np.arange(speed.size), voltage, velocity=step * np.round(speed / step))
     found = identify(replace(shown, hardware=Hardware(1.0, None, 0, 12.0)))
     assert tuning.loop_for(

@@ -28,7 +28,6 @@ def signal(rise: float, seed: int, friction: float = TC) -> Record:
 @pytest.mark.parametrize("friction", [TC, 5 * TC])
 def test_the_resistance_of_a_recording_is_the_windings_whatever_the_friction(seed, friction):
     found = resistance(signal(0.1, seed, friction))
-    assert found is not None
     assert found.value == pytest.approx(1.1 * R, abs=4 * found.std)
     assert found.std < 0.03 * R
 
