@@ -122,6 +122,16 @@ class Browser:
         answer = self.ask("Runtime.evaluate", expression=expression, returnByValue=True)
         return answer["result"].get("value")
 
+    def drawn(self) -> None:
+        """Wait until changes are drawn: a chart follows in the next frame."""
+        frames = "done => requestAnimationFrame(() => requestAnimationFrame(done))"
+        self.ask("Runtime.evaluate", awaitPromise=True, expression=f"new Promise({frames})")
+
+    def unfold(self) -> None:
+        """Open everything that is folded, and wait until it is drawn."""
+        self.value("document.querySelectorAll('details').forEach(one => { one.open = true; })")
+        self.drawn()
+
     def picture(self, path: Path, *selectors: str, margin: int = 12) -> None:
         """Write the page as PNG, or the part with the elements of the selectors."""
         size = self.ask("Page.getLayoutMetrics")["cssContentSize"]

@@ -5,6 +5,8 @@ import numpy as np
 
 from smp_motor_ident.finding import Finding
 from smp_motor_ident.record import Hardware
+from smp_motor_ident.report import tuning_page
+from smp_motor_ident.report.figures import Comparison
 from smp_motor_ident.result import (
     Candidate,
     Correlation,
@@ -13,6 +15,7 @@ from smp_motor_ident.result import (
     Quantity,
     ResidualTests,
 )
+from smp_motor_ident.tune import Loop, design
 
 PHYSICAL = {
     "resistance": (12.919, "ohm"),
@@ -27,6 +30,24 @@ PHYSICAL = {
 def correlation(*values: float) -> Correlation:
     """With a band of 0.1."""
     return Correlation(np.arange(1.0, 1 + len(values)), np.array(values), 0.1)
+
+
+def comparison(role: str, seconds: float = 20.0, begin: float = 0.0) -> Comparison:
+    """Return a speed that follows a square of the voltage, under white noise."""
+    rng = np.random.default_rng(7)
+    time = np.arange(begin, begin + seconds, 0.005)
+    voltage = 8 * np.sign(np.sin(2 * np.pi * 0.37 * time))
+    speed = 25 * voltage
+    return Comparison(role, "bag", time, voltage, speed + rng.normal(0, 2, time.size), speed)
+
+
+def tuning_of_two(monkeypatch, one: Estimate) -> tuning_page.Tuning:
+    """Return a tuning page's choice of two designs: half of the bandwidth, and all of it."""
+    monkeypatch.setattr(tuning_page, "BANDWIDTH_SHARES", (0.5, 1.0))
+    monkeypatch.setattr(tuning_page, "PHASE_MARGINS", (60.0,))
+    monkeypatch.setattr(tuning_page, "BAND_DRAWS", 20)
+    loop = Loop(sample_time=0.005, gear_ratio=65.5, counts_per_revolution=500, supply_voltage=12.0)
+    return tuning_page.tuning_of(one, loop, design(one, loop))
 
 
 def estimate(wheel: str = "front_left", *, current: bool = True) -> Estimate:

@@ -9,38 +9,27 @@ from typing import Any
 import numpy as np
 import pytest
 from browser import CHROMIUM, Browser
-from results import estimate
+from results import comparison, estimate, tuning_of_two
 
 from smp_motor_ident.finding import Finding
-from smp_motor_ident.report import commissioning, fleet, tuning_page
-from smp_motor_ident.report.figures import Comparison
+from smp_motor_ident.report import commissioning, fleet
 from smp_motor_ident.report.html import Report, render
 from smp_motor_ident.result import Quantity, plain
-from smp_motor_ident.tune import Loop, design
 from smp_motor_ident.tune.verification import Change, Reading
 
 AXE = find_spec("axe_core_python")
-FRAME = "new Promise(done => requestAnimationFrame(() => requestAnimationFrame(done)))"
 
 pytestmark = pytest.mark.skipif(not CHROMIUM, reason="no Chromium on this machine")
 
 
 def report(monkeypatch: pytest.MonkeyPatch) -> str:
     """Of two motors, one with a tuning page, and one that failed."""
-    monkeypatch.setattr(tuning_page, "BANDWIDTH_SHARES", (0.5, 1.0))
-    monkeypatch.setattr(tuning_page, "PHASE_MARGINS", (60.0,))
-    monkeypatch.setattr(tuning_page, "BAND_DRAWS", 20)
-    loop = Loop(sample_time=0.005, gear_ratio=65.5, counts_per_revolution=500, supply_voltage=12.0)
-    time = np.arange(4000) * 0.005
-    voltage = 8 * np.sign(np.sin(2 * np.pi * 0.37 * time))
-    noisy = 25 * voltage + np.random.default_rng(7).normal(0, 2, time.size)
-    compared = Comparison("estimation", "bag", time, voltage, noisy, 25 * voltage)
     one, other = estimate(), estimate("rear_right", current=False)
     return render(
         Report(
-            {one.wheel: one, other.wheel: other}, {one.wheel: [compared]},
+            {one.wheel: one, other.wheel: other}, {one.wheel: [comparison("estimation")]},
             {"rear_left": "voltage is constant; excite the motor"}, {"Command": "identify a b"},
-            {one.wheel: tuning_page.tuning_of(one, loop, design(one, loop))},
+            {one.wheel: tuning_of_two(monkeypatch, one)},
         )
     )  # fmt: skip
 
@@ -87,7 +76,6 @@ def commissioning_page(_: pytest.MonkeyPatch) -> str:
 
 def violations(browser: Browser) -> list[str]:
     """What axe-core calls serious or critical, with the elements."""
-    assert AXE is not None and AXE.origin is not None
     browser.value(Path(AXE.origin).with_name("axe.min.js").read_text("utf-8") + ";0")
     said = browser.ask(
         "Runtime.evaluate", awaitPromise=True, returnByValue=True,
@@ -111,10 +99,8 @@ def test_no_page_has_a_serious_violation_wide_or_narrow_light_or_dark(made, tmp_
     with Browser(tmp_path / "profile") as browser:
         for width, dark in ((1200, False), (390, True), (1200, True), (390, False)):
             browser.open(file, width, dark=dark)
-            unfold = "document.querySelectorAll('details').forEach(one => { one.open = true; })"
-            for shown in ("", unfold):
-                browser.value(shown)
-                browser.ask("Runtime.evaluate", awaitPromise=True, expression=FRAME)
+            for show in (browser.drawn, browser.unfold):
+                show()
                 assert browser.value("document.documentElement.scrollWidth") <= width
                 assert violations(browser) == []
         assert browser.complaints == []
@@ -142,8 +128,8 @@ def test_charts_work_with_mouse_and_keyboard(tmp_path, monkeypatch):
         assert browser.value("getComputedStyle(document.activeElement).outlineStyle") != "none"
         whole = browser.value("document.activeElement.dataset.shown")
         press(browser, "+", "+")
-        browser.ask("Runtime.evaluate", awaitPromise=True, expression=FRAME)
+        browser.drawn()
         assert browser.value("document.activeElement.dataset.shown") != whole
         press(browser, "Escape")
-        browser.ask("Runtime.evaluate", awaitPromise=True, expression=FRAME)
+        browser.drawn()
         assert browser.value("document.activeElement.dataset.shown") == whole

@@ -1,16 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """The plan of a commissioning, before anything moves."""
 
-import contextlib
 import json
 import shutil
-from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import pytest
+from client import Client
 from results import estimate as make_estimate
 
 from smp_motor_ident.cli import checking, commissioning, plan, steps
@@ -38,36 +37,6 @@ def test_a_dry_run_prints_and_draws_the_plan_and_touches_nothing(tmp_path, capsy
     # Four wheels: 32 s of checks, 35 s of signals and 4 s around each, 32 s to compute, the drive.
     assert "6 V" in lines[3] and "35 s of excitation, about 2 min 5 s in all" in lines[-1]
     assert not folder.exists()
-
-
-class Client:
-    """Of a robot that is there and whose wheels report."""
-
-    def __enter__(self):
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        pass
-
-    def find_wheels(self) -> list[str]:
-        return ["left"]
-
-    def wait_for_wheels(self, wheels: Sequence[str], timeout: float) -> dict[str, float]:
-        return dict.fromkeys(wheels, 200.0)
-
-    def paused(self, wheels: Sequence[str]) -> contextlib.AbstractContextManager[None]:
-        return contextlib.nullcontext()
-
-    def refuse_second_reporters(self, wheels: Sequence[str]) -> None:
-        pass
-
-    def until(self, condition: Callable[[], bool], timeout: float) -> bool:
-        return condition()
-
-    def runs_controller(self, wheel: str) -> bool:
-        return self.controlled
-
-    controlled = True
 
 
 FIGURES = Figures(200.0, 0.001, 0, 0.0, 0.5, 1.0, 1.0, 1.0, 25.0, 0.4, 0.05, 5.0)
@@ -105,7 +74,7 @@ class Steps:
 
     def connect(self, *_: object) -> Client:
         self.left = self.fuel
-        return Client()
+        return Client("left", 200.0)
 
     def step(self, name: str, *given: Any) -> Any:
         self.done.append(name)
@@ -213,7 +182,7 @@ def test_a_drive_alone_is_asked_for_too(robot, capsys):
 def test_gains_that_no_controller_could_keep_are_refused_before_anything_moves(
     robot, capsys, monkeypatch
 ):
-    monkeypatch.setattr(Client, "controlled", False)
+    monkeypatch.setattr(Client, "runs_controller", lambda *_: False)
     assert main([*robot.given, "--apply"]) == 2
     assert "no wheel_pid runs for left" in capsys.readouterr().err and robot.done == []
     assert main(robot.given) == 0

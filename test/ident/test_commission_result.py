@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """A commissioning that is cut off and gone on with ends with the numbers of one that is not."""
 
-import contextlib
 import json
 import math
 from collections.abc import Sequence
@@ -11,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
+from client import Client
 from motors import record
 from rclpy.serialization import serialize_message
 
@@ -37,27 +37,9 @@ class Robot:
         monkeypatch.setattr(steps, "excite", self.excite)
         monkeypatch.setattr(commissioning, "_verify", lambda *_: "as designed")
 
-    def connect(self, *_: object) -> Any:
+    def connect(self, *_: object) -> Client:
         self.left = self.fuel
-        return contextlib.nullcontext(self)
-
-    def find_wheels(self) -> list[str]:
-        return [WHEEL]
-
-    def wait_for_wheels(self, wheels: Sequence[str], timeout: float) -> dict[str, float]:
-        return dict.fromkeys(wheels, RATE)
-
-    def paused(self, wheels: Sequence[str]) -> Any:
-        return contextlib.nullcontext()
-
-    def refuse_second_reporters(self, wheels: Sequence[str]) -> None:
-        pass
-
-    def until(self, *_: object) -> bool:
-        return True
-
-    def runs_controller(self, wheel: str) -> bool:
-        return True
+        return Client(WHEEL, RATE)
 
     def use(self) -> None:
         self.left -= 1

@@ -6,12 +6,11 @@ import math
 import re
 from dataclasses import replace
 from html.parser import HTMLParser
-from typing import Any
 
 import numpy as np
 import pytest
 from browser import CHROMIUM, Browser
-from results import PHYSICAL, correlation, estimate
+from results import PHYSICAL, comparison, correlation, estimate, tuning_of_two
 from scipy.signal import lfilter
 
 from smp_motor_ident.finding import Finding
@@ -22,17 +21,7 @@ from smp_motor_ident.report.html import Report, render
 from smp_motor_ident.report.summary import find_doubted
 from smp_motor_ident.report.tuning_page import tuning_charts
 from smp_motor_ident.result import Quantity, ResidualTests, Share
-from smp_motor_ident.tune import Loop, design
 from smp_motor_ident.tune.curves import Curves
-
-
-def comparison(role: str, n: int = 4000) -> Comparison:
-    """A first-order response with white noise."""
-    rng = np.random.default_rng(7)
-    time = np.arange(n) * 0.005
-    voltage = 8 * np.sign(np.sin(2 * np.pi * 0.37 * time))
-    speed = 25 * voltage
-    return Comparison(role, "bag", time, voltage, speed + rng.normal(0, 2, n), speed)
 
 
 class Outside(HTMLParser):
@@ -53,10 +42,7 @@ class Outside(HTMLParser):
 
 @pytest.fixture(scope="module")
 def page() -> str:
-    wheels = {
-        "front_left": estimate(),
-        "rear_right": estimate("rear_right", current=False),
-    }
+    wheels = {"front_left": estimate(), "rear_right": estimate("rear_right", current=False)}
     parts = [comparison("estimation"), comparison("validation")]
     failures = {"rear_left": "voltage is constant; excite the motor"}
     return render(Report(wheels, {"front_left": parts}, failures, {"Command": "identify a b"}))
@@ -89,8 +75,7 @@ def test_page_tells_failures_warnings_and_unidentifiable_parameters(page):
 
 
 @pytest.mark.parametrize(
-    "named",
-    [["time_constant"], ["dc_gain"], ["dc_gain", "time_constant"], []],
+    "named", [["time_constant"], ["dc_gain"], ["dc_gain", "time_constant"], []]
 )
 def test_a_finding_marks_its_quantities_unreliable_or_else_all(named):
     known = estimate(current=False)  # gain and time constant
@@ -147,16 +132,6 @@ def test_each_chart_has_a_drawing_for_print_and_words_for_those_who_cannot_see_i
     )
 
 
-FRAME = "new Promise(done => requestAnimationFrame(() => requestAnimationFrame(done)))"
-"""A change of a chart is drawn in the next frame."""
-
-
-def open_all(browser: Browser) -> None:
-    """Unfold everything, and wait until it is drawn."""
-    browser.value("document.querySelectorAll('details').forEach(one => { one.open = true; })")
-    browser.ask("Runtime.evaluate", awaitPromise=True, expression=FRAME)
-
-
 @pytest.mark.skipif(not CHROMIUM, reason="no Chromium on this machine")
 def test_a_browser_draws_every_chart_zooms_and_asks_nobody(page, tmp_path):
     file = tmp_path / "report.html"
@@ -167,14 +142,14 @@ def test_a_browser_draws_every_chart_zooms_and_asks_nobody(page, tmp_path):
             # Folded charts are drawn when opened.
             figures = browser.value("document.querySelectorAll('figure.chart').length")
             assert 0 < browser.value("document.querySelectorAll('figure.ready').length") < figures
-            open_all(browser)
+            browser.unfold()
             for inside in ("figure.ready", "figure canvas"):
                 assert browser.value(f"document.querySelectorAll('{inside}').length") == figures
             assert browser.value("document.documentElement.scrollWidth") <= width
         # Speed, residual and voltage share their time: all three show the zoomed stretch.
         browser.value("document.querySelector('button[data-key=\"0\"]').click()")
         browser.value("document.querySelector('button[data-key=\"+\"]').click()")
-        browser.ask("Runtime.evaluate", awaitPromise=True, expression=FRAME)
+        browser.drawn()
         shown = "[...document.querySelectorAll('.live')].slice(0, 3).map(e => e.dataset.shown)"
         first, *others = browser.value(shown)
         begin, end = map(float, first.split())
@@ -186,17 +161,13 @@ def test_a_browser_draws_every_chart_zooms_and_asks_nobody(page, tmp_path):
 
 
 def test_sliders_of_the_tuning_page_choose_designs_that_tune_has_made(tmp_path, monkeypatch):
-    monkeypatch.setattr(tuning_page, "BANDWIDTH_SHARES", (0.5, 1.0))
-    monkeypatch.setattr(tuning_page, "PHASE_MARGINS", (60.0,))
-    monkeypatch.setattr(tuning_page, "BAND_DRAWS", 20)
-    loop = Loop(sample_time=0.005, gear_ratio=65.5, counts_per_revolution=500, supply_voltage=12.0)
-    tuning = tuning_page.tuning_of(estimate(), loop, design(estimate(), loop))
+    tuning = tuning_of_two(monkeypatch, estimate())
     soft, own = tuning.choices
     assert tuning.chosen == 1
     crossovers = [one.design.margins.crossover for one in (soft, own) if one.design]
     # A design at a bandwidth keeps it to the 5 % that the method allows itself.
     assert crossovers[0] == pytest.approx(0.5 * crossovers[1], rel=0.05)
-    (held,) = page_wheels({"front_left": tuning})
+    (held,) = tuning_page.page_data({"front_left": tuning})["wheels"].values()
     assert [f"p: {one.design.gains.p}" in shown["yaml"]
             for one, shown in zip((soft, own), held["choices"])
             if one.design] == [True, True]  # fmt: skip
@@ -220,11 +191,6 @@ def test_sliders_of_the_tuning_page_choose_designs_that_tune_has_made(tmp_path, 
         assert browser.value("document.documentElement.scrollWidth") <= 390
         assert browser.complaints == []
         assert set(browser.requests) == {file.as_uri()}
-
-
-def page_wheels(tunings: dict[str, tuning_page.Tuning]) -> list[dict[str, Any]]:
-    """Return the data of each wheel for the page's script."""
-    return list(tuning_page.page_data(tunings)["wheels"].values())
 
 
 def test_the_chart_of_the_residuals_shows_what_the_test_has_judged():

@@ -6,10 +6,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 from browser import CHROMIUM, Browser
-from results import estimate
+from results import comparison, estimate
 
 from smp_motor_ident.finding import Finding
 from smp_motor_ident.report.figures import Comparison
@@ -46,14 +45,7 @@ def poor(wheel: str) -> Estimate:
 
 def drive() -> list[Comparison]:
     """Return 40 s of a speed that follows a square of the voltage, the last third held out."""
-    rng, parts = np.random.default_rng(7), []
-    for role, seconds in (("estimation", 27.0), ("validation", 13.0)):
-        time = np.arange(0.0, seconds, 0.005)
-        voltage = 8 * np.sign(np.sin(2 * np.pi * 0.37 * time))
-        speed = 25 * voltage
-        noisy = speed + rng.normal(0, 2, time.size)
-        parts.append(Comparison(role, "bag", time, voltage, noisy, speed))
-    return parts
+    return [comparison("estimation", 27.0), comparison("validation", 13.0)]
 
 
 @pytest.fixture(scope="module")
@@ -177,7 +169,6 @@ def test_the_picture_begins_where_single_answers_are_seen_and_shows_all_on_reque
     assert end - begin == pytest.approx(3.2, abs=0.1)
     assert begin > 26.9 and end <= 40.0
     browser.value("document.querySelector('button[data-key=\"0\"]').click()")
-    done = "new Promise(done => requestAnimationFrame(() => requestAnimationFrame(done)))"
-    browser.ask("Runtime.evaluate", awaitPromise=True, expression=done)
+    browser.drawn()
     begin, end = map(float, browser.value(shown).split())
     assert (begin, end) == pytest.approx((0.0, 40.0), abs=0.1)

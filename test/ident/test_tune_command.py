@@ -100,14 +100,9 @@ def test_small_gains_are_shown_with_their_digits():
     design = SimpleNamespace(
         gains=PidGains(p=1.49e-4, i=1.5e-3),
         margins=SimpleNamespace(phase=88.0, gain=560.65, sensitivity=1.02),
-        performance=SimpleNamespace(
-            settling=2.07,
-            overshoot=0.0,
-            load_integral=6.62e-4,
-            peak_voltage=4.04,
-            control_noise=0.1,
-        ),
-    )
+        performance=SimpleNamespace(settling=2.07, overshoot=0.0, load_integral=6.62e-4,
+                                    peak_voltage=4.04, control_noise=0.1),
+    )  # fmt: skip
     assert row(design).split()[:3] == ["0.000149", "0.0015", "0"]
     assert "0.000662" in row(design)
 
@@ -200,18 +195,9 @@ def test_refusal_is_one_line_with_its_exit_code(identified, capsys, arguments, c
     assert sorted(p.name for p in identified.iterdir()) == ["identification.json"]
 
 
-@pytest.mark.parametrize(
-    ("content", "words"),
-    [(None, "cannot be read"), ("{", "is not JSON"), ('{"schema": 7}', "schema")],
-)
-def test_unreadable_identification_is_named(tmp_path, capsys, content, words):
-    path = tmp_path / "identification.json"
-    if content is not None:
-        path.write_text(content)
-    assert main([str(path)]) == 2
-    words_shown = capsys.readouterr().err
-    assert words in words_shown
-    assert "identification.json" in words_shown
+def test_unreadable_identification_is_named(tmp_path, capsys):
+    assert main([str(tmp_path / "identification.json")]) == 2
+    assert "identification.json: cannot be read" in capsys.readouterr().err
 
 
 def test_nothing_to_tune_is_told(capsys):

@@ -15,9 +15,11 @@ from smp_motor_ident.finding import Finding
 from smp_motor_ident.report.document import identification_document
 from smp_motor_ident.result import ChainRecord, Estimate, Quantity, Share, Systematic
 from smp_motor_ident.tune import design
-from smp_motor_ident.tune.margins import loop_margins
+from smp_motor_ident.tune.feedback import Feedback, spectral_radius
+from smp_motor_ident.tune.margins import batch_margins, loop_margins
 from smp_motor_ident.tune.motors import motors_of
 from smp_motor_ident.tune.plant import sample
+from smp_motor_ident.tune.problem import Problem
 
 DOUBT = Finding("dead_zone", "unreliable", "a dead zone of 2 V", {}, "record slow ramps")
 
@@ -109,6 +111,11 @@ def test_drives_within_the_uncertainty_stay_within_the_specified_bands():
     assert spec.samples == 300
 
 
+def margins_on(motor, made):
+    """Return the margins of a design's gains on another motor."""
+    return loop_margins(sample(motor, made.loop), made.feedback)
+
+
 def test_a_second_lag_that_the_record_hides_is_within_the_stated_margins():
     one_lag = estimate(time_constant_product=0.0)
     product = Quantity(None, None, (0.0, 4e-4), "s^2", "unidentifiable")
@@ -118,13 +125,11 @@ def test_a_second_lag_that_the_record_hides_is_within_the_stated_margins():
     aware, ignorant = design(hidden, LOOP), design(one_lag, LOOP)
     motor = motors_of(estimate(time_constant_product=3.5e-4))
 
-    def of_true(made):
-        return loop_margins(sample(motor, made.loop), made.feedback)
-
-    assert of_true(aware).phase > aware.specification.phase_margin.low > 59.0
-    assert of_true(aware).gain > aware.specification.gain_margin.low
-    assert of_true(aware).sensitivity < aware.specification.sensitivity.high
-    assert of_true(ignorant).phase < ignorant.specification.phase_margin.low - 3.0
+    real, unaware = margins_on(motor, aware), margins_on(motor, ignorant)
+    assert real.phase > aware.specification.phase_margin.low > 59.0
+    assert real.gain > aware.specification.gain_margin.low
+    assert real.sensitivity < aware.specification.sensitivity.high
+    assert unaware.phase < ignorant.specification.phase_margin.low - 3.0
     # No more is taken for open than two lags of one motor can be.
     product = replace(product, ci95=(0.0, 1.0))
     wide = replace(hidden, combinations={**hidden.combinations, "time_constant_product": product})
@@ -149,13 +154,11 @@ def test_motors_that_the_record_does_not_exclude_keep_the_stated_margins(stated,
     aware, ignorant = design(replace(known, systematic=(unseen,)), loop), design(known, loop)
     true = motors_of(estimate(**{**motor, **other}))
 
-    def of_true(made):
-        return loop_margins(sample(true, made.loop), made.feedback)
-
-    assert of_true(aware).gain > aware.specification.gain_margin.low
-    assert of_true(aware).sensitivity < aware.specification.sensitivity.high
-    assert of_true(ignorant).gain < 0.9 * ignorant.specification.gain_margin.low
-    assert of_true(ignorant).sensitivity > ignorant.specification.sensitivity.high + 0.03
+    real, unaware = margins_on(true, aware), margins_on(true, ignorant)
+    assert real.gain > aware.specification.gain_margin.low
+    assert real.sensitivity < aware.specification.sensitivity.high
+    assert unaware.gain < 0.9 * ignorant.specification.gain_margin.low
+    assert unaware.sensitivity > ignorant.specification.sensitivity.high + 0.03
 
 
 def test_an_unreliable_identification_is_refused_or_widens_the_design():
@@ -202,12 +205,6 @@ def test_the_lower_end_of_a_friction_range_is_fed_forward():
 
 def test_coarse_counts_cost_no_more_than_the_limits_ask_for():
     """Of PI and PID gains of a dense grid within margins and control noise none is far better."""
-    from smp_motor_ident.tune.feedback import Feedback, spectral_radius
-    from smp_motor_ident.tune.margins import batch_margins
-    from smp_motor_ident.tune.motors import motors_of
-    from smp_motor_ident.tune.plant import sample
-    from smp_motor_ident.tune.problem import Problem
-
     loop = replace(LOOP, counts_per_revolution=48.0, noise_voltage=0.48)
     one = design(estimate(), loop, structure="pi")
     problem = Problem(sample(motors_of(estimate()), loop), loop)

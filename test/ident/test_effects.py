@@ -1,0 +1,143 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Effects of drivers, sensors and loads are found, and leave the motor's values right."""
+
+from dataclasses import replace
+
+import motors
+import numpy as np
+import pytest
+from independent import TABLE_1, simulate
+
+from smp_motor_ident.estimate import estimate
+from smp_motor_ident.record import Hardware, Record
+
+LEAST = 1.5
+"""Command below which a driver puts out nothing [V]."""
+
+
+@pytest.mark.parametrize("current", [False, True])
+def test_a_driver_that_ignores_small_commands_is_named_and_leaves_the_motor_right(current):
+    level = 0.6 * np.random.default_rng(3).integers(-15, 16, 30)
+    command = np.repeat(level, 100)
+    made = motors.record(current=current, voltage=np.where(np.abs(command) < LEAST, 0.0, command))
+    found = estimate(replace(made, voltage=command))
+    assert "hard_dead_zone" in [f.code for f in found.findings]
+    # No command lies in between, so the data tell no more.
+    least = found.combinations["least_command"]
+    assert 1.2 < least.value < 1.8
+    assert 0.05 < least.total_std < 0.6
+    assert least.total_ci95[0] < LEAST < least.total_ci95[1]
+    truth = motors.truth("rear_left", 0.3)
+    for name in ("dc_gain", "time_constant", "static_voltage"):
+        assert found.value(name) == pytest.approx(truth[name], rel=2e-3)
+
+
+@pytest.mark.parametrize("error", [0.0, 0.003, 0.06])
+def test_encoder_error_once_a_turn_is_found_with_its_size(error):
+    rng = np.random.default_rng(1)
+    t = np.arange(4000) / 200
+    voltage = np.repeat(rng.uniform(-9.0, 9.0, 100), 40)
+    r, inductance, k, j, b = TABLE_1["rear_left"]
+    turned = simulate(t, voltage, r, inductance, k, j, b, 0.3 * k / r, 0 * t, 50)[:, 2]
+    count = np.floor((turned + error * np.sin(turned + 1.0)) * 2000 / (2 * np.pi)).astype(np.int64)
+    found = estimate(Record("motor", t, voltage, count=count, hardware=Hardware(1.0, 2000.0)))
+    assert ("encoder_error" in [f.code for f in found.findings]) == (error > 0)
+    if error:
+        size = found.combinations["encoder_error"]
+        assert abs(abs(size.value) - error) < 5 * size.std + 0.01 * error
+    truth = motors.truth("rear_left", 0.3)
+    motors.check(found, truth, ("dc_gain", "time_constant", "static_voltage"))
+
+
+COMMAND_RATE = 200.0
+FINER = 20  # steps of the driver's clock to a sample
+
+
+def jittered(latest: float, seed: int) -> Record:
+    """Return random steps that reach the motor up to so many samples late, each by its own time."""
+    rng = np.random.default_rng(seed)
+    asked = np.repeat(rng.uniform(-10.0, 10.0, 200), 10)
+    fine = np.repeat(asked, FINER)
+    changes = np.flatnonzero(np.diff(fine)) + 1
+    given = fine.copy()
+    for k, late in zip(changes, rng.integers(0, int(latest * FINER) + 1, changes.size)):
+        given[k : k + late] = fine[k - 1]
+    t = np.arange(given.size) / (COMMAND_RATE * FINER)
+    out = simulate(t, given, *TABLE_1["rear_left"], 0.0, np.zeros(t.size), 4)
+    rows = np.arange(FINER - 1, given.size, FINER)  # a row holds what ran up to its instant
+    speed = out[rows, 1] + 0.2 * rng.standard_normal(rows.size)
+    return Record("rear_left", t[rows] - t[rows[0]], asked, velocity=speed)
+
+
+def test_the_scatter_of_commands_is_covered():
+    for found in (estimate(jittered(1.0, seed)) for seed in range(3)):
+        names = ("dc_gain", "time_constant", "time_constant_product")
+        motors.check(found, motors.truth("rear_left", 0.0), names, sigmas=3.5, total=True)
+
+
+def test_a_delay_that_is_declared_stays_so_under_scatter():
+    found = estimate(jittered(1.0, 0), fixed={"delay": 0.5 / COMMAND_RATE})
+    assert found.combinations["delay"].value == 0.5 / COMMAND_RATE
+    truth = motors.truth("rear_left", 0.0)
+    motors.check(found, truth, ["time_constant"], sigmas=3.5, total=True)
+
+
+RATE, SECONDS, WINDOW, STATIC = 500, 16, 10, 0.4
+R, L, K, J, B = TABLE_1["rear_left"]
+
+
+def loaded(load, *, counts, seed, least=-9.0, back=SECONDS):
+    """Return a motor under a load [of its friction], its speed a mean over ten rows, or counts.
+
+    From ``back`` [s] on it is driven the other way.
+    """
+    rng = np.random.default_rng(seed)
+    time = np.arange(RATE * SECONDS) / RATE
+    voltage = np.repeat(rng.uniform(least, 9.0, 100), 83)[: time.size]
+    voltage = np.where(time < back, voltage, -voltage)
+    friction = STATIC * K / R
+    out = simulate(time, voltage, R, L, K, J, B, friction, friction * load, 40)
+    if counts:
+        count = np.floor(out[:, 2] / motors.QUANTUM).astype(np.int64)
+        return Record("motor", time, voltage, count=count, hardware=Hardware(1.0, 500.0))
+    angle = np.concatenate([np.zeros(WINDOW), out[:, 2]])
+    speed = (angle[WINDOW:] - angle[:-WINDOW]) * RATE / WINDOW
+    speed += 0.2 * rng.standard_normal(time.size)
+    current = out[:, 0] + 0.01 * rng.standard_normal(time.size)
+    return Record("motor", time, voltage, current=current, velocity=speed)
+
+
+def stepped(at: float) -> np.ndarray:
+    return np.where(np.arange(RATE * SECONDS) < at * RATE, 0.0, 0.7)
+
+
+@pytest.mark.parametrize("at", [4.1, 9.3])
+@pytest.mark.parametrize("counts", [False, True])
+def test_a_load_that_steps_is_found_and_moves_no_number(counts, at):
+    found = estimate(loaded(stepped(at), counts=counts, seed=3))
+    (words,) = [f for f in found.findings if f.code == "load_step"]
+    assert abs(words.evidence["load_step_at"] * SECONDS - at) < 0.06 * SECONDS
+    true = motors.truth("rear_left", STATIC)
+    assert not found.unreliable
+    names = ["dc_gain", "static_voltage", *(() if counts else ("resistance", "inductance"))]
+    motors.check(found, true, names, floor=2e-3, most=0.05)  # the simulator's steps: 1e-3
+
+
+@pytest.mark.parametrize(("counts", "back"), [(False, SECONDS), (True, SECONDS), (True, 9.4)])
+def test_of_a_motor_that_turns_one_way_the_friction_is_not_told_from_loads(counts, back):
+    """In one direction all the time, or reversed from the left-out part of the load on."""
+    found = estimate(loaded(stepped(9.3), counts=counts, seed=5, least=3.0, back=back))
+    motors.check(found, motors.truth("rear_left", STATIC), ["dc_gain"], floor=2e-3)
+
+
+def test_no_load_is_not_a_step():
+    found = estimate(loaded(np.zeros(RATE * SECONDS), counts=False, seed=4))
+    assert "load_step" not in {f.code for f in found.findings}
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_an_angle_that_wanders_under_torque_noise_shows_no_step(seed):
+    rng = np.random.default_rng(20 + seed)
+    found = estimate(loaded(3.0 * rng.standard_normal(RATE * SECONDS), counts=True, seed=seed))
+    codes = {f.code for f in found.findings}
+    assert "torque_noise" in codes and "load_step" not in codes
