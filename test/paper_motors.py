@@ -12,6 +12,12 @@ TABLE_1 = {
 """R [ohm], L [H], K [V s/rad], J [kg m^2], b [N m s/rad]."""
 
 
+def combinations_of(p):
+    """Return what voltage and speed tell of a motor or of its model."""
+    names = ("dc_gain", "time_constant", "time_constant_product", "static_voltage")
+    return {name: getattr(p, name) for name in names}
+
+
 def paper_motor(wheel, static_voltage=0.0, inductance=None):
     """Return a motor of the table with Coulomb friction, perhaps with another inductance."""
     R, L, K, J, b = TABLE_1[wheel]

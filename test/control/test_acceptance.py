@@ -147,9 +147,7 @@ def limit_with_winding(dt: float) -> float:
     ("factor", "static", "reached"),
     [(2.1, 0.0, 2.1), (6.0, 0.0, 5.0), (3.0, 1.0, (3.0 * 2.2 - 1.0) / 2.2)],
 )
-def test_feed_forward_of_another_motor_is_refused_by_how_fast_it_would_drive(
-    factor, static, reached
-):
+def test_feed_forward_of_another_motor_is_refused_with_its_speed(factor, static, reached):
     # Feed-forward alone for a fifth of the speed at 12 V less friction; at most those 12 V.
     given = settings(p=0.0, i=0.0, feedforward_velocity=factor * RATIO / GAIN,
                      feedforward_acceleration=0.0)  # fmt: skip

@@ -5,6 +5,7 @@ import math
 
 import numpy as np
 import pytest
+from paper_motors import combinations_of
 
 from smp_motor_control.encoder import Encoder
 from smp_motor_control.motor import Gearbox, MotorParameters
@@ -37,28 +38,17 @@ def model_based_settings(model: MotorModel, supply: float, bandwidth: float) -> 
     """Gains that place a pole at the bandwidth, with the motor's own equation fed forward."""
     a0, tau = GEARBOX.ratio / model.dc_gain, model.time_constant
     gains = PidGains(
-        p=a0 * tau * bandwidth,
-        i=a0 * bandwidth,
-        u_clamp_min=-supply,
-        u_clamp_max=supply,
-        antiwindup_strategy="back_calculation",
-        feedforward_static=model.static_voltage,
-        feedforward_velocity=a0,
-        feedforward_acceleration=a0 * tau,
-    )
+        p=a0 * tau * bandwidth, i=a0 * bandwidth, u_clamp_min=-supply, u_clamp_max=supply,
+        antiwindup_strategy="back_calculation", feedforward_static=model.static_voltage,
+        feedforward_velocity=a0, feedforward_acceleration=a0 * tau,
+    )  # fmt: skip
     drive = Drive(
         top_speed=GEARBOX.to_wheel(0.9 * model.dc_gain * supply),
         time_constant=tau,
         time_constant_product=model.time_constant_product,
     )
-    return LoopSettings(
-        gains=gains,
-        transition_time=0.05,
-        speed_source="observer",
-        model=model,
-        reference_delay=1e-3,
-        drive=drive,
-    )
+    return LoopSettings(gains=gains, transition_time=0.05, speed_source="observer", model=model,
+                        reference_delay=1e-3, drive=drive)  # fmt: skip
 
 
 def drive_a_wheel(settings, entry, dt, setpoint, steps=STEPS):
@@ -83,12 +73,7 @@ def drive_a_wheel(settings, entry, dt, setpoint, steps=STEPS):
 
 
 def entry_of(model: MotorModel, supply: float) -> MotorEntry:
-    parameters = MotorParameters.from_combinations(
-        dc_gain=model.dc_gain,
-        time_constant=model.time_constant,
-        time_constant_product=model.time_constant_product,
-        static_voltage=model.static_voltage,
-    )
+    parameters = MotorParameters.from_combinations(**combinations_of(model))
     return MotorEntry(parameters, GEARBOX, ENCODER, supply, delay=model.delay)
 
 

@@ -5,7 +5,7 @@ import math
 
 import numpy as np
 import pytest
-from paper_motors import TABLE_1, paper_motor
+from paper_motors import TABLE_1, combinations_of, paper_motor
 from scipy.integrate import solve_ivp
 
 from smp_motor_control.errors import ParameterError
@@ -134,13 +134,7 @@ def test_vanishing_inductance_approaches_zero_inductance():
 
 
 def twin_of(p: MotorParameters) -> MotorParameters:
-    return MotorParameters.from_combinations(
-        dc_gain=p.dc_gain,
-        time_constant=p.time_constant,
-        time_constant_product=p.time_constant_product,
-        static_voltage=p.static_voltage,
-        resistance=3.0,
-    )
+    return MotorParameters.from_combinations(**combinations_of(p), resistance=3.0)
 
 
 def test_combinations_survive_the_way_there_and_back():

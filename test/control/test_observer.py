@@ -5,7 +5,7 @@ import math
 
 import numpy as np
 import pytest
-from paper_motors import paper_motor
+from paper_motors import combinations_of, paper_motor
 from scipy.linalg import expm
 
 from smp_motor_control.encoder import DifferencedSpeed, Encoder
@@ -27,8 +27,7 @@ ENCODER = Encoder(500.0)
 
 
 def model_of(p: MotorParameters, **changes: float) -> MotorModel:
-    names = ("dc_gain", "time_constant", "time_constant_product", "static_voltage")
-    return MotorModel(**{**{name: getattr(p, name) for name in names}, **changes})
+    return MotorModel(**combinations_of(p) | changes)
 
 
 def volts(t: float) -> float:

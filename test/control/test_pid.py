@@ -74,9 +74,7 @@ gain = st.floats(0.0, 1e3)
     tracking=st.floats(0.0, 10.0),
     inputs=st.lists(st.tuples(finite, finite, st.floats(1e-4, 1.0), finite), max_size=20),
 )  # fmt: skip
-def test_output_never_leaves_its_clamp_and_the_integral_stays_finite(
-    p, i, d, strategy, tracking, inputs
-):
+def test_output_is_clamped_and_the_integral_finite(p, i, d, strategy, tracking, inputs):
     gains = PidGains(p=p, i=i, d=d, antiwindup_strategy=strategy, tracking_time_constant=tracking,
                      feedforward_velocity=1.0, feedforward_static=1.0, **VOLTS)  # fmt: skip
     pid = Pid(gains)

@@ -12,12 +12,13 @@ from smp_motor_control.pid import Pid, PidGains
 
 FILE = Path(__file__).parent.parent / "data" / "conformance" / "pid_cases.json"
 CASES = json.loads(FILE.read_text(encoding="utf-8"))
-NAMES = {
-    "u_max": "u_clamp_max",
-    "u_min": "u_clamp_min",
-    "i_max": "i_clamp_max",
-    "i_min": "i_clamp_min",
-}
+NAMES = {f"{x}_{end}": f"{x}_clamp_{end}" for x in "ui" for end in ("min", "max")}
+
+
+def cases(kind, key=""):
+    """Parametrize a test by the cases of a kind that have a key."""
+    some = [case for case in CASES[kind] if not key or key in case]
+    return pytest.mark.parametrize("case", some, ids=lambda case: case["id"])
 
 
 def close(value: float, expected: object, tolerance: float) -> bool:
@@ -36,7 +37,7 @@ def gains_of(given: dict, **more: object) -> PidGains:
     return PidGains(**named, setpoint_weight_p=1.0, setpoint_weight_d=1.0, **more)
 
 
-@pytest.mark.parametrize("case", CASES["cases"], ids=lambda case: case["id"])
+@cases("cases")
 def test_sequence_gives_the_numbers_of_control_toolbox(case):
     pid = Pid(gains_of(case["gains"]))
     if "expect_tracking_time_constant" in case:
@@ -60,7 +61,7 @@ def test_sequence_gives_the_numbers_of_control_toolbox(case):
             assert close(out.i_term, step["expect_i_term"], case["abs_tol"]), number
 
 
-@pytest.mark.parametrize("case", CASES["pid_controller_cases"], ids=lambda case: case["id"])
+@cases("pid_controller_cases")
 def test_whole_controller_gives_the_numbers_of_pid_controller(case):
     forward = case.get("feedforward_gain", 0.0) if case.get("feedforward_enabled") else 0.0
     reference, state, dt = case["reference"], case["state"], case["dt"]
@@ -102,11 +103,7 @@ def test_bad_bounds_are_refused_on_construction(case):
         gains_of(case["input"])
 
 
-@pytest.mark.parametrize(
-    "case",
-    [case for case in CASES["parameter_cases"] if "set" in case],
-    ids=lambda case: case["id"],
-)
+@cases("parameter_cases", "set")
 def test_bad_bounds_leave_the_gains_as_they_were(case):
     gains = gains_of(case["initial"])
     pid = Pid(gains)

@@ -173,9 +173,7 @@ drives = st.builds(
     st.floats(-1.0, 1.0),
     st.sampled_from([0.001, 0.005, 0.01]),
 )
-def test_a_change_as_fast_as_voltage_allows_ends_at_rest_within_it(
-    drive, bend, begin, end, push, dt
-):
+def test_fastest_change_ends_at_rest_within_its_voltage(drive, bend, begin, end, push, dt):
     if bend > 0.001:
         drive = replace(drive, time_constant_product=bend * drive.time_constant**2)
     top, tau = drive.top_speed, drive.time_constant

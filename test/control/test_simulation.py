@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from paper_motors import combinations_of
 from wheel_simulation import (
     DriveSettings,
     Timing,
@@ -24,16 +25,6 @@ MOTORS = load_motors(Path(__file__).parents[2] / "config" / "motors_paper.yaml")
 GAINS = PidGains(p=2.5, i=80.0, d=0.05, derivative_filter_time_constant=0.005)
 
 
-def model_of(wheel: str) -> MotorModel:
-    p = MOTORS[wheel].parameters
-    return MotorModel(
-        dc_gain=p.dc_gain,
-        time_constant=p.time_constant,
-        time_constant_product=p.time_constant_product,
-        static_voltage=p.static_voltage,
-    )
-
-
 def settings_of(wheel: str, **changes) -> LoopSettings:
     ratio, p = MOTORS[wheel].gearbox.ratio, MOTORS[wheel].parameters
     gains = replace(
@@ -44,7 +35,12 @@ def settings_of(wheel: str, **changes) -> LoopSettings:
         feedforward_velocity=ratio * p.a0,
         feedforward_acceleration=ratio * p.a1,
     )
-    values = {"gains": gains, "transition_time": 0.2, "model": model_of(wheel), **changes}
+    values = {
+        "gains": gains,
+        "transition_time": 0.2,
+        "model": MotorModel(**combinations_of(p)),
+        **changes,
+    }
     return LoopSettings(**values)
 
 

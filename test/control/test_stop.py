@@ -17,6 +17,8 @@ from smp_motor_control.wheel.controller import State, WheelSettings
 from smp_motor_control.wheel.loop import LoopSettings
 from smp_motor_control.wheel.stop import AVERAGING_WINDOW_S, REST_SPEED, STANDSTILL_SETPOINT
 
+MODEL = MotorModel(dc_gain=GAIN * 65.5, time_constant=TAU)
+KNOWN = OperatingConditions(sample_time=DT, supply=SUPPLY, gearbox=Gearbox(65.5))
 UNHURRIED = {
     "drive": {"drive": Drive(top_speed=3.0, time_constant=1e5)},
     "delay": {"reference_delay": 10.0},
@@ -153,9 +155,7 @@ def test_settings_are_taken_up_to_the_stop_time(name):
 
 
 def test_the_speed_that_is_braked_from_is_the_fastest_that_is_known():
-    model = MotorModel(dc_gain=GAIN * 65.5, time_constant=TAU)
-    known = OperatingConditions(sample_time=DT, supply=SUPPLY, gearbox=Gearbox(65.5))
-    loop = LoopSettings(gains=GAINS, model=model)
+    known, loop = KNOWN, LoopSettings(gains=GAINS, model=MODEL)
     top = GAIN * SUPPLY  # 4.32 rad/s
     check(replace(loop, limits=ProfileLimits(acceleration=1.02 * top)), known)
     with pytest.raises(ParameterError, match=f"a wheel at {top:.3g} rad/s stops 1.02 s"):
@@ -190,15 +190,12 @@ def test_a_stop_begins_again_after_a_reset():
 
 @pytest.mark.parametrize("seed", range(3))
 def test_whatever_is_accepted_stands_in_time(seed):
-    draw = random.Random(seed)
-    model = MotorModel(dc_gain=GAIN * 65.5, time_constant=TAU)
-    known = OperatingConditions(sample_time=DT, supply=SUPPLY, gearbox=Gearbox(65.5))
-    stood = 0
+    draw, stood = random.Random(seed), 0
     for _ in range(60):
         gains = replace(GAINS, p=10 ** draw.uniform(-2, 1), i=10 ** draw.uniform(-4, 2))
         loop = LoopSettings(
             gains=gains,
-            model=model,
+            model=MODEL,
             limits=ProfileLimits(
                 acceleration=draw.choice([math.inf, 10 ** draw.uniform(-2, 2)]),
                 jerk=draw.choice([math.inf, 10 ** draw.uniform(-1, 4)]),
@@ -211,7 +208,7 @@ def test_whatever_is_accepted_stands_in_time(seed):
             stop_time=draw.choice([0.2, 1.0, 3.0]),
         )  # fmt: skip
         try:
-            check(loop, known)
+            check(loop, KNOWN)
         except ParameterError:
             continue
         world = World(replace(settings(), loop=loop)).run(3.0)

@@ -151,12 +151,14 @@ def test_a_wheel_that_is_silent_for_ever_is_taken_to_turn_as_its_side_does():
     assert (left, right) == pytest.approx((8.0, 16.0), abs=0.01)
 
 
+def shifted(when, by):
+    """Return a fault that moves positions at some instants."""
+    return lambda w, t, s: s._replace(position=s.position + by) if when(w, t) else s
+
+
 @pytest.mark.parametrize("spike", [3.0, -50.0, 1e9, -1e300, math.nan])
 def test_position_spikes_cost_no_way(spike):
-    def see(wheel: str, t: float, sample: WheelSample) -> WheelSample:
-        spoilt = wheel == "a" and round(t * RATE) % 50 == 17
-        return sample._replace(position=sample.position + spike) if spoilt else sample
-
+    see = shifted(lambda wheel, t: wheel == "a" and round(t * RATE) % 50 == 17, spike)
     left, right, feedback = drive(see)
     # A non-finite position is bridged by the velocity, and the next one corrects the sum.
     assert (left, right) == pytest.approx((8.0, 16.0), abs=0.01)
@@ -164,10 +166,7 @@ def test_position_spikes_cost_no_way(spike):
 
 
 def test_a_counter_that_is_reset_costs_less_than_a_sample():
-    def see(wheel: str, t: float, sample: WheelSample) -> WheelSample:
-        return sample._replace(position=sample.position - 40.0) if t > 3.0 else sample
-
-    left, right, feedback = drive(lambda w, t, s: see(w, t, s) if w == "a" else s, seconds=8.0)
+    left, right, feedback = drive(shifted(lambda w, t: w == "a" and t > 3.0, -40.0), seconds=8.0)
     assert (left, right) == pytest.approx((10.0, 20.0), abs=0.01)
     assert "position jumped" in feedback.problems["a"]
 
@@ -194,11 +193,12 @@ def test_a_position_that_wraps_is_named_and_costs_nothing(lowest, speed):
     assert "position wraps" in feedback.problems["a"]
 
 
-def test_a_position_that_wraps_elsewhere_costs_no_more_than_the_velocity_tells():
-    def see(wheel: str, t: float, sample: WheelSample) -> WheelSample:
-        return sample._replace(position=sample.position % 3.7)
+def ahead(wheel: str, t: float) -> float:
+    return 2.0 * min(t, 7.9)
 
-    left, right, feedback = drive(see, seconds=8.0, ways=lambda wheel, t: 2.0 * min(t, 7.9))
+
+def test_a_position_that_wraps_elsewhere_costs_no_more_than_the_velocity_tells():
+    left, right, feedback = drive(lambda w, t, s: s._replace(position=s.position % 3.7), 8.0, ahead)
     assert (left, right) == pytest.approx((15.8, 15.8), abs=0.05)
     assert "position jumped" in feedback.problems["c"]
 
@@ -207,7 +207,7 @@ def test_a_position_that_is_never_filled_is_named_and_the_velocity_tells_the_way
     def see(wheel: str, t: float, sample: WheelSample) -> WheelSample:
         return sample._replace(position=0.0)
 
-    left, right, feedback = drive(see, seconds=8.0, ways=lambda wheel, t: 2.0 * min(t, 7.9))
+    left, right, feedback = drive(see, seconds=8.0, ways=ahead)
     assert (left, right) == pytest.approx((15.8, 15.8), abs=0.05)
     feedback = make()
     for k in range(RATE):
@@ -234,8 +234,5 @@ def test_late_and_repeated_samples_neither_add_nor_lose_motion():
 
 
 def test_a_clock_that_is_set_back_costs_one_sample():
-    def see(wheel: str, t: float, sample: WheelSample) -> WheelSample:
-        return sample._replace(stamp=sample.stamp - 3600.0) if t > 3.0 else sample
-
-    left, right, _ = drive(see, seconds=8.0)
+    left, right, _ = drive(lambda w, t, s: s._replace(stamp=s.stamp - 3600.0 * (t > 3.0)), 8.0)
     assert (left, right) == pytest.approx((10.0, 20.0), abs=0.05)

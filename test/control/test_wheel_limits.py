@@ -178,11 +178,17 @@ def test_speeds_up_to_the_implausible_count_in_both_directions():
         assert feed.wheel.refused == {"feedback velocity that is not a number or implausible": 1}
 
 
-def test_a_count_that_jumps_is_left_out_and_the_speed_begins_anew():
+def counted() -> Feed:
+    """Return a wheel at a set-point of zero whose speed is a difference of counts."""
     loop = LoopSettings(gains=GAINS, speed_source="difference", difference_window=1)
     feed = Feed(replace(SETTINGS, loop=loop))
     feed.wheel.set_hardware(Gearbox(1.0), Encoder(64.0), 12.0)
     feed.ask(0.0)
+    return feed
+
+
+def test_a_count_that_jumps_is_left_out_and_the_speed_begins_anew():
+    feed = counted()
     per_count = 2.0 * math.pi  # rad/s of one count a sample
     feed.give(encoder_count=0)
     assert feed.give(encoder_count=1) == pytest.approx(-12.0)
@@ -198,10 +204,7 @@ def test_a_count_that_jumps_is_left_out_and_the_speed_begins_anew():
 
 
 def test_a_clock_that_jumps_begins_the_counted_speed_anew():
-    loop = LoopSettings(gains=GAINS, speed_source="difference", difference_window=1)
-    feed = Feed(replace(SETTINGS, loop=loop))
-    feed.wheel.set_hardware(Gearbox(1.0), Encoder(64.0), 12.0)
-    feed.ask(0.0)
+    feed = counted()
     feed.give(encoder_count=0)
     assert feed.give(encoder_count=0) == 0.0
     feed.give(encoder_count=1, age=60.0)

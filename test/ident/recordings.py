@@ -12,6 +12,7 @@ import numpy as np
 import yaml
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
+from scipy.signal import cont2discrete, lfilter
 
 from smp_motor_ident.bag import read_records
 from smp_motor_ident.record import Record
@@ -119,6 +120,27 @@ def motion(n=200, wheel="front_left", step=10000000, seed=1, bits=0):
     count = np.rint(position * RATIO * COUNTS / (2 * np.pi)).astype(np.int64)
     time = START + step * np.arange(n, dtype=np.int64)
     return Motion(wheel, time, voltage, rng.normal(0, 1, n), velocity, position, count, bits)
+
+
+def follow(voltage):
+    """Return the speed of a motor, 20 rad/s/V and 0.1 s, under voltages held for 10 ms each."""
+    speed = np.zeros(len(voltage))
+    for k in range(1, speed.size):
+        speed[k] = speed[k - 1] + (1 - np.exp(-0.1)) * (20 * voltage[k - 1] - speed[k - 1])
+    return speed
+
+
+def write_steps(path: Path, seconds=20.0, level=6.0, seed=1, begin=0.0) -> Path:
+    """Write a motor, 25 rad/s/V and 60 ms, under random steps; ``u`` holds from its row on."""
+    rng = np.random.default_rng(seed)
+    n = round(seconds / 0.01)
+    voltage = np.repeat(rng.uniform(-level, level, n // 20 + 1), 20)[:n]
+    b, a, _ = cont2discrete(([25.0], [0.06, 1.0]), 0.01)
+    speed = lfilter(b.ravel(), a, voltage) + rng.normal(0.0, 0.5, n)
+    table = np.column_stack((begin + np.arange(n) * 0.01, voltage, speed))
+    path.parent.mkdir(exist_ok=True)
+    np.savetxt(path, table, delimiter=",", header="t,u,w", comments="", fmt="%.15g")
+    return path
 
 
 def merged(*motions: Motion, **options: Any) -> list[Sent]:

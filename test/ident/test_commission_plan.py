@@ -179,9 +179,7 @@ def test_a_drive_alone_is_asked_for_too(robot, capsys):
     assert "--yes" in capsys.readouterr().err and robot.done == []
 
 
-def test_gains_that_no_controller_could_keep_are_refused_before_anything_moves(
-    robot, capsys, monkeypatch
-):
+def test_apply_without_a_controller_is_refused_before_motion(robot, capsys, monkeypatch):
     monkeypatch.setattr(Client, "runs_controller", lambda *_: False)
     assert main([*robot.given, "--apply"]) == 2
     assert "no wheel_pid runs for left" in capsys.readouterr().err and robot.done == []

@@ -109,9 +109,7 @@ def test_fixed_resistance_is_reported_as_fixed_and_still_separates_nothing_witho
         ("front_right", 0.3, "auto", "motor_constant", 1e-4, 0.01),  # of a data sheet
     ],
 )
-def test_resistance_and_another_value_separate_the_rest_without_current(
-    wheel, friction, model, other, floor, most
-):
+def test_two_known_values_separate_the_rest(wheel, friction, model, other, floor, most):
     truth = motors.truth(wheel, friction)
     recording = motors.record(wheel, current=False, static_voltage=friction)
     known = {n: truth[n] for n in ("resistance", other)}

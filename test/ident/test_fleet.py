@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 from browser import CHROMIUM, Browser
+from recordings import write_steps
 
 from smp_motor_ident.cli import fleet as command
 from smp_motor_ident.cli.identify import main
@@ -77,9 +78,7 @@ def fake(path: str, settings: tuple[Any, ...]) -> list[Row]:
     return [command._row(path, wheel="left", values={"dc_gain": gain(25.0)}, fit_percent=97.0)]
 
 
-def test_a_broken_bag_fails_alone_a_killed_worker_loses_nothing_and_no_work_is_done_twice(
-    tmp_path, monkeypatch
-):
+def test_a_broken_bag_and_a_killed_worker_lose_no_other_result(tmp_path, monkeypatch):
     monkeypatch.setattr(command, "identify_one", fake)
     folder = tmp_path / "robot7"
     folder.mkdir()
@@ -111,26 +110,12 @@ def test_a_cluster_without_dask_is_refused_with_advice(tmp_path, capsys):
         assert "pip install distributed" in capsys.readouterr().err
 
 
-def write_drive(path: Path, begun: float) -> Path:
-    """Write steps of a motor of 25 rad/s/V and 60 ms, with stamps from ``begun`` on [s]."""
-    rng = np.random.default_rng(1)
-    volts = np.repeat(rng.uniform(-6, 6, 60), 20)
-    speed = np.zeros(volts.size)
-    for k in range(1, speed.size):  # exact over a step of 10 ms
-        speed[k] = speed[k - 1] + 0.1535 * (25.0 * volts[k - 1] - speed[k - 1])
-    speed += rng.normal(0.0, 0.5, speed.size)
-    rows = np.column_stack((begun + 0.01 * np.arange(volts.size), volts, speed))
-    path.parent.mkdir(exist_ok=True)
-    np.savetxt(path, rows, delimiter=",", header="t,u,w", comments="", fmt="%.15g")
-    return path
-
-
 MAPPED = ["--map", "time=t", "voltage=u", "velocity=w"]
 MONDAY = 1_788_767_600.0  # 2026-09-07 07:53:20 UTC
 
 
 def test_signals_are_mapped_alike_for_every_recording(tmp_path):
-    bags = [str(write_drive(tmp_path / name / "a.csv", 0.0)) for name in ("one", "two")]
+    bags = [str(write_steps(tmp_path / name / "a.csv", 12.0)) for name in ("one", "two")]
     assert main([*bags, "--fleet", *MAPPED, "--output", str(tmp_path / "out"), "--quiet"]) == 0
     table = list(csv.DictReader((tmp_path / "out" / "fleet.csv").open()))
     assert [r["robot"] for r in table] == ["one", "two"]
@@ -143,7 +128,7 @@ def test_signals_are_mapped_alike_for_every_recording(tmp_path):
 
 def test_a_recording_has_its_own_time_and_its_numbers_are_printed_with_units(tmp_path, capsys):
     bags = [
-        write_drive(tmp_path / robot / f"day{day}.csv", MONDAY + DAY * day)
+        write_steps(tmp_path / robot / f"day{day}.csv", 12.0, begin=MONDAY + DAY * day)
         for robot in ("one", "two")
         for day in (0, 3)
     ]

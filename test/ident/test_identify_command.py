@@ -15,7 +15,7 @@ from subprocess import PIPE
 import numpy as np
 import pytest
 from browser import CHROMIUM, Browser
-from scipy.signal import cont2discrete, lfilter
+from recordings import write_steps
 
 from smp_motor_control.motor.file import load_motors
 from smp_motor_ident.cli import frame, identification, tune
@@ -25,26 +25,14 @@ from smp_motor_ident.finding import Finding
 from smp_motor_ident.report import words
 from smp_motor_ident.result import ChainRecord, Estimate, Quantity
 
-GAIN, LAG, STEP = 25.0, 0.06, 0.01
+GAIN, LAG = 25.0, 0.06
 MAP = ("--map", "time=t", "voltage=u", "velocity=w")
 REAL = Path(__file__).parents[3] / "shared" / "data" / "prbs_gearmotor"
 
 
-def write_csv(path: Path, *, seconds: float = 20.0, level: float = 6.0, seed: int = 1) -> Path:
-    """A first-order motor under random steps; ``u`` holds from its row to the next."""
-    rng = np.random.default_rng(seed)
-    n = round(seconds / STEP)
-    voltage = np.repeat(rng.uniform(-level, level, n // 20 + 1), 20)[:n]
-    b, a, _ = cont2discrete(([GAIN], [LAG, 1.0]), STEP)
-    speed = lfilter(b.ravel(), a, voltage) + rng.normal(0.0, 0.5, n)
-    table = np.column_stack((np.arange(n) * STEP, voltage, speed))
-    np.savetxt(path, table, delimiter=",", header="t,u,w", comments="", fmt="%.9g")
-    return path
-
-
 @pytest.fixture(scope="module")
 def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_csv(tmp_path_factory.mktemp("data") / "log.csv")
+    return write_steps(tmp_path_factory.mktemp("data") / "log.csv")
 
 
 def complaint(capsys: pytest.CaptureFixture[str]) -> str:
@@ -119,9 +107,7 @@ def test_terminal_json_and_page_state_the_same_numbers(recording, tmp_path, caps
             assert float(written) == pytest.approx(stated, abs=0.501 * digit)
 
 
-def test_the_terminal_shows_the_three_gravest_messages_and_all_on_request(
-    recording, tmp_path, monkeypatch, capsys
-):
+def test_terminal_shows_the_three_gravest_messages(recording, tmp_path, monkeypatch, capsys):
     findings = [
         *(Finding(f"note_{k}", "note", f"note {k} of dc_gain") for k in range(2)),
         *(Finding(f"odd_{k}", "warning", f"warning {k}", {}, f"do {k}") for k in range(3)),
@@ -176,9 +162,7 @@ def test_it_replaces_nothing_without_force(recording, tmp_path, capsys):
         ([], "BAG"),
     ],
 )
-def test_wrong_usage_is_one_line_and_leaves_nothing(
-    arguments, word, recording, tmp_path, monkeypatch, capsys
-):
+def test_wrong_usage_is_refused(arguments, word, recording, tmp_path, monkeypatch, capsys):
     (tmp_path / "log.csv").write_bytes(recording.read_bytes())
     monkeypatch.chdir(tmp_path)
     assert main([*arguments, "--output", "result"]) == 2
@@ -192,14 +176,14 @@ def test_without_output_it_asks_for_one(recording, capsys):
 
 
 def test_a_motor_that_was_not_moved_is_refused_with_advice(tmp_path, capsys):
-    still = write_csv(tmp_path / "still.csv", level=0.0)
+    still = write_steps(tmp_path / "still.csv", level=0.0)
     assert main([str(still), *MAP, "--output", str(tmp_path / "result")]) == 1
     assert "record" in complaint(capsys)
     assert not (tmp_path / "result").exists()
 
 
 def test_good_wheels_are_written_when_another_is_refused(tmp_path, capsys):
-    good, still = write_csv(tmp_path / "a.csv"), write_csv(tmp_path / "b.csv", level=0.0)
+    good, still = write_steps(tmp_path / "a.csv"), write_steps(tmp_path / "b.csv", level=0.0)
     both = np.hstack([np.loadtxt(p, delimiter=",", skiprows=1) for p in (good, still)])
     np.savetxt(
         tmp_path / "both.csv", both, delimiter=",", header="t,u,w,t2,u2,w2", comments="", fmt="%g"
@@ -215,7 +199,7 @@ def test_good_wheels_are_written_when_another_is_refused(tmp_path, capsys):
 
 
 def test_another_recording_judges_the_model(recording, tmp_path):
-    other = write_csv(tmp_path / "other.csv", seed=2)
+    other = write_steps(tmp_path / "other.csv", seed=2)
     output = tmp_path / "result"
     arguments = [str(recording), *MAP, "--validate", str(other), "--output", str(output)]
     assert main(arguments) == 0

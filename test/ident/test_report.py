@@ -48,17 +48,12 @@ def page() -> str:
     return render(Report(wheels, {"front_left": parts}, failures, {"Command": "identify a b"}))
 
 
-def test_page_loads_nothing_from_elsewhere(page):
+def test_page_loads_nothing_from_elsewhere_and_its_identifiers_are_unique(page):
     outside = Outside()
     outside.feed(page)
     assert outside.addresses == []
     assert "@import" not in page
     assert not re.search(r"url\((?!#)", page)
-
-
-def test_identifiers_of_the_figures_do_not_collide(page):
-    outside = Outside()
-    outside.feed(page)
     assert len(outside.identifiers) == len(set(outside.identifiers))
 
 

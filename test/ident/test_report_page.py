@@ -75,9 +75,7 @@ def tops(browser: Browser, *selectors: str) -> list[float]:
 
 @pytest.mark.parametrize(("width", "highest"), [(1280, 5000), (720, 12_000), (390, 12_000)])
 @pytest.mark.parametrize("dark", [False, True])
-def test_four_wheels_full_of_warnings_are_short_and_never_scroll_sideways(
-    browser, file, width, highest, dark
-):
+def test_four_poor_wheels_fit_a_short_page(browser, file, width, highest, dark):
     browser.open(file, width, dark=dark)
     # A phone of 390 px shows a third of 1280 px, so the limit of 5,000 is scaled.
     assert browser.value("document.documentElement.scrollHeight") <= highest
@@ -156,9 +154,7 @@ def test_intervals_side_by_side_are_seen_on_an_axis(browser, file):
     assert total / random == pytest.approx(3.14, rel=0.02)
 
 
-def test_the_picture_begins_where_single_answers_are_seen_and_shows_all_on_request(
-    browser, tmp_path
-):
+def test_chart_opens_at_single_responses_and_zooms_out(browser, tmp_path):
     known = estimate()
     path = tmp_path / "report.html"
     path.write_text(render(Report({known.wheel: known}, {known.wheel: drive()})))

@@ -108,9 +108,7 @@ def test_small_gains_are_shown_with_their_digits():
 
 
 @pytest.mark.parametrize("export", [[], ["--export", "wpilib"]])
-def test_a_folder_that_cannot_be_written_is_named_before_anything_is_designed(
-    identified, capsys, monkeypatch, export
-):
+def test_unwritable_folder_is_named_before_a_design(identified, capsys, monkeypatch, export):
     def design(*_: object, **__: object) -> None:
         raise AssertionError("designed before looking")
 

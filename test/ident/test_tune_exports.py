@@ -37,9 +37,7 @@ def test_the_targets_own_arithmetic_settles_and_overshoots_as_specified(name):
 
 
 @pytest.mark.parametrize("name", FORMATS)
-def test_the_command_writes_the_targets_parameters_and_names_its_limitations(
-    name, tmp_path, capsys
-):
+def test_export_writes_parameters_and_limitations(name, tmp_path, capsys):
     output = tmp_path / "gains.txt"
     assert main([str(MOTORS), "--export", name, "--output", str(output)]) == 0
     text = output.read_text()

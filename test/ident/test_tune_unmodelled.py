@@ -4,11 +4,12 @@
 from dataclasses import replace
 
 import control
+import drives
 import numpy as np
 import pytest
 
 from smp_motor_ident.errors import DesignError
-from smp_motor_ident.result import Estimate, ModelError, Quantity, ResidualTests
+from smp_motor_ident.result import Estimate, ModelError, ResidualTests
 from smp_motor_ident.tune import METHODS, Loop, design
 from smp_motor_ident.tune.feedback import Feedback
 from smp_motor_ident.tune.motors import motors_of
@@ -27,14 +28,7 @@ FREQUENCY = (0.5, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0, 200.0, 600.0)
 
 
 def estimate(shown, bound) -> Estimate:
-    values = {"dc_gain": 25.0, "time_constant": 0.05, "time_constant_product": 1e-4}
-    values["static_voltage"] = 0.2
-    deviations = [0.002 * v for v in values.values()]
-    one = Estimate(
-        "motor", "second_order", {},
-        {n: Quantity(v, s) for (n, v), s in zip(values.items(), deviations, strict=True)},
-        tuple(values), np.diag(np.square(deviations)),
-    )  # fmt: skip
+    one = drives.estimate(std=0.002, time_constant_product=1e-4, static_voltage=0.2)
     return replace(one, residuals=ResidualTests(model_error=ModelError(FREQUENCY, shown, bound)))
 
 

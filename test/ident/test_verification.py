@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from paper_motors import combinations_of
 from wheel_simulation import Timing, simulate_closed_loop
 
 from smp_motor_control.motor.file import load_motors
@@ -94,11 +95,8 @@ def test_samples_that_nobody_answered_are_in_the_prediction(designed):
 
 def test_what_the_integral_keeps_from_one_change_to_the_next_is_in_the_prediction(designed):
     # Friction of 2 V holds the wheel after each stop, so the integral stays.
-    m = ENTRY.parameters
-    rubbing = MotorParameters.from_combinations(
-        dc_gain=m.dc_gain, time_constant=m.time_constant,
-        time_constant_product=m.time_constant_product, static_voltage=2.0,
-    )  # fmt: skip
+    values = combinations_of(ENTRY.parameters) | {"static_voltage": 2.0}
+    rubbing = MotorParameters.from_combinations(**values)
     known = {**ESTIMATE.combinations, "static_voltage": Quantity(2.0, status="fixed")}
     setpoint, lasts = 1.0, 1.0
 

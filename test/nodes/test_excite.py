@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """excite as its own process, on a simulated motor."""
 
-from __future__ import annotations
-
 import signal
 
 

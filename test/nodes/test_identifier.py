@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """identifier as its own process, on a plant that others excite."""
 
-from __future__ import annotations
-
 import math
 import signal
 

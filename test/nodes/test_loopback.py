@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """No node of a test, or of the demo, can be reached from another computer."""
 
-from __future__ import annotations
-
 import os
 import socket
 import struct

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """motor_plant as its own process."""
 
-from __future__ import annotations
-
 import math
 import signal
 import time

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """play as a process: it sends the recorded messages at their times, and nothing else."""
 
-from __future__ import annotations
-
 import threading
 import time
 from collections.abc import Callable, Iterator

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """record as a process: nothing is lost or changed, however it ends."""
 
-from __future__ import annotations
-
 import re
 import signal
 import time

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """A node that is given what it cannot run with says so in one line and ends with code 2."""
 
-from __future__ import annotations
-
 import pytest
 
 from smp_motor_control.errors import ParameterError

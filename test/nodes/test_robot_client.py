@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The client of a running robot against a wheel whose graph becomes known piece by piece."""
 
-from __future__ import annotations
-
 import threading
 
 import pytest

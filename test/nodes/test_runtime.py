@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Common code of nodes: the lean executor, settings, start and end of a process."""
 
-from __future__ import annotations
-
 import signal
 import sys
 import time

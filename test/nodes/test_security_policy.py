@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """security/policy.xml allows each node the topics it uses, and few nodes the motor commands."""
 
-from __future__ import annotations
-
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Callable
 from pathlib import Path

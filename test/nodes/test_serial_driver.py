@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """serial_driver over a pseudo-terminal, with a firmware that loses bytes, resets and vanishes."""
 
-from __future__ import annotations
-
 import contextlib
 import math
 import os

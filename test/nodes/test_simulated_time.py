@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Every node in simulated time: it reports a missing clock and follows a present one."""
 
-from __future__ import annotations
-
 import itertools
 import time
 from pathlib import Path

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """skid_steer as its own process: commands, limits, parameters, leaving."""
 
-from __future__ import annotations
-
 import json
 import math
 import sys

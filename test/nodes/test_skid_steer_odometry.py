@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Odometry of skid_steer as its own process: from feedback, over stalls, in simulated time."""
 
-from __future__ import annotations
-
 import math
 import signal
 import time

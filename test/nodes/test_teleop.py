@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """teleop_wheels as a process in its own terminal."""
 
-from __future__ import annotations
-
 import contextlib
 import fcntl
 import os

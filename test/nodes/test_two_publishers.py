@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Two publishers of one wheel, such as a forgotten node, are reported by every reader."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator
 

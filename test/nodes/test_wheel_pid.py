@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """wheel_pid as its own process, fed by the test sample by sample."""
 
-from __future__ import annotations
-
 import math
 import os
 import signal

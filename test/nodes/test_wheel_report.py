@@ -1,10 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Diagnostics of wheel_pid, without a process."""
 
-from __future__ import annotations
-
 import math
-from collections.abc import Callable
 from types import SimpleNamespace
 
 import pytest
@@ -19,9 +16,7 @@ from smp_motor_control.wheel.loop import LoopSettings
 def said(monkeypatch):
     """Return the log and the assessment of a wheel with these gains."""
 
-    def ask(
-        gains: PidGains, put: Callable[[WheelController], object] = lambda wheel: None
-    ) -> tuple[list[str], bytes, str]:
+    def ask(gains, put=lambda wheel: None):
         assessments, log = [], []
         diagnostics = lambda node, assess, joint: (  # noqa: E731
             assessments.append(assess) or SimpleNamespace(due=False, publish=lambda: None)

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Evaluation of the samples of a wheel test."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """tune --apply on four running wheels: real nodes, real plant, over DDS."""
 
-from __future__ import annotations
-
 import math
 import signal
 import sys

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The guards of `make check` that look at what is tracked."""
 
-from __future__ import annotations
-
 import shutil
 import subprocess
 from collections.abc import Callable

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """commission on a robot that runs, as its user runs it."""
 
-from __future__ import annotations
-
 import json
 import signal
 from collections.abc import Callable

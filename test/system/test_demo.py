@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The demo as its user runs it: once to the end, and ended half-way in three ways."""
 
-from __future__ import annotations
-
 import json
 import math
 import os

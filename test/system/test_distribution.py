@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """pip and colcon install all files of the repository's packages."""
 
-from __future__ import annotations
-
 import json
 import re
 import runpy

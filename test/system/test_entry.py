@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Ctrl-C in the first second: while an executable is still importing."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

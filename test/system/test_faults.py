@@ -5,8 +5,6 @@ No node may die, no wheel may turn when it should not, every fault is named on /
 within its time-out, and driving resumes without a restart.
 """
 
-from __future__ import annotations
-
 import itertools
 import math
 import os

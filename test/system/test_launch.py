@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The launch file, where a ROS with launch is sourced."""
 
-from __future__ import annotations
-
 import importlib.util
 from pathlib import Path
 

@@ -5,8 +5,6 @@ They take minutes, so they run on request: ``make test ARGS="-m long"``. Lines o
 where ROS is sourced.
 """
 
-from __future__ import annotations
-
 import os
 import re
 import shutil

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Several robots: every executable in the robot's namespace, wheels one level below."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable
 from pathlib import Path

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The set-up reports missing parts in one line, and repeats only if its inputs change."""
 
-from __future__ import annotations
-
 import fcntl
 import json
 import os

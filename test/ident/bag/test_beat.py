@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Arrival times are fitted to the period of a regular sender; other times are unchanged."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from independent import simulate
@@ -36,7 +34,6 @@ def arrivals(kind: str, n: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
 def test_the_lower_envelope_of_the_arrivals_is_the_beat(kind, seed):
     late, true = arrivals(kind, 4000, seed)
     beat = find_beat(late)
-    assert beat is not None
     wrong = beat.time - true
     # A twentieth of a sample: the line touches arrivals whose latency is a hundredth of that.
     assert np.ptp(wrong) < 0.05 * T
@@ -49,7 +46,6 @@ def test_few_lost_samples_leave_the_beat_where_it_is():
     late = np.maximum.accumulate(true + rng.exponential(0.3 * T, true.size))
     kept = np.sort(rng.choice(true.size, 3980, replace=False))
     beat = find_beat(np.rint(late[kept]).astype(np.int64))
-    assert beat is not None
     # A loss is located within a few samples; between the two places the index is off by one.
     assert np.median(np.abs(beat.time - true[kept])) < 0.05 * T
     assert np.std(beat.time - true[kept]) < np.std(late[kept] - true[kept])
@@ -165,7 +161,6 @@ def test_how_sure_the_beat_is_of_its_period_is_how_it_scatters():
         rng = np.random.default_rng(seed)
         late = np.maximum.accumulate(T * np.arange(300) + rng.exponential(0.8 * T, 300))
         beat = find_beat(np.rint(late).astype(np.int64))
-        assert beat is not None
         found.append((beat.period, beat.deviation))
     periods, deviations = np.array(found).T
     # A jackknife of eight parts of an edge of a hull errs to the safe side, by 2.2 here.

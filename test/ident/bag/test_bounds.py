@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Damaged and hostile files: bounded memory, one line, no traceback."""
 
-from __future__ import annotations
-
 import random
 import resource
 import subprocess
@@ -89,13 +87,8 @@ def test_a_bomb_is_refused_within_bounded_memory(tmp_path, kind):
         "except BagError as error:\n    print(error)\n"
         "print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before)\n"
     )
-    done = subprocess.run(
-        [sys.executable, "-c", code, str(path)],
-        capture_output=True,
-        text=True,
-        check=True,
-        cwd=ROOT,
-    )
+    command = [sys.executable, "-c", code, str(path)]
+    done = subprocess.run(command, capture_output=True, text=True, check=True, cwd=ROOT)
     message, kilobytes = done.stdout.splitlines()
     assert "SMP_BAG_UNPACKED" in message and path.name in message
     assert int(kilobytes) < 100_000  # unpacked on disk, a piece at a time

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Counters that wrap, of every width, and counters that start again: by the test's own counting."""
 
-from __future__ import annotations
-
 import dataclasses
 from pathlib import Path
 
@@ -136,9 +134,7 @@ def test_wrong_samples_and_a_way_back_to_zero_are_no_resets(raw, measured):
 @pytest.mark.parametrize(
     ("length", "blocks", "found_at"), [(40, 4, 3), (40, 5, 0), (100, 11, 10), (80, 10, 0)]
 )
-def test_three_resets_or_a_hundredth_of_a_long_record_count_and_more_do_not(
-    length, blocks, found_at
-):
+def test_up_to_three_resets_or_one_in_a_hundred_rows_count(length, blocks, found_at):
     raw = np.tile(np.arange(0, 1000 * length, 1000), blocks)
     found = unwrap(raw, 0, np.full(raw.size - 1, 1000.0))
     assert found.resets.size == found_at

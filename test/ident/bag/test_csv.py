@@ -1,14 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """CSV files of different software with the same mapping."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 import pytest
+from recordings import follow
 
 from smp_motor_ident.bag import list_topics, read_experiments, read_records
 from smp_motor_ident.errors import BagError
@@ -20,9 +19,7 @@ Y = np.array([0.0, 90.0, 180.0, -90.0, 45.0])
 MAP = ["voltage=u velocity=y:deg/s time=t"]
 
 
-def table(
-    separator: str = ",", decimal: str = ".", head: str = "t,u,y", newline: str = "\n"
-) -> str:
+def table(separator=",", decimal=".", head="t,u,y", newline="\n"):
     rows = [head.replace(",", separator)]
     rows += [separator.join(f"{x:.6f}".replace(".", decimal) for x in row) for row in zip(T, U, Y)]
     return newline.join(rows) + newline
@@ -150,10 +147,7 @@ def test_a_voltage_may_have_been_held_up_to_its_row(tmp_path):
 def test_the_motion_tells_whether_a_voltage_held_up_to_its_row(tmp_path, lead, output):
     rng = np.random.default_rng(1)
     volts = np.repeat(rng.uniform(-6, 6, 30), 20)
-    speed = np.zeros(volts.size)
-    for k in range(1, volts.size):
-        acting = volts[k] if lead else volts[k - 1]
-        speed[k] = speed[k - 1] + (1 - np.exp(-0.1)) * (20 * acting - speed[k - 1])
+    speed = follow(np.append(volts[1:], 0.0) if lead else volts)
     motion = speed + rng.normal(0, 0.3, speed.size)
     if output != "velocity":
         motion = np.rint(10 * np.cumsum(speed))
@@ -286,9 +280,7 @@ def test_unreadable_files_are_refused_with_name_and_reason(tmp_path, text, mappi
     assert "\n" not in str(refused.value)
 
 
-@pytest.mark.skipif(
-    not DATA.exists(), reason="needs the recordings of the repository's parent folder"
-)
+@pytest.mark.skipif(not DATA.exists(), reason="recordings are not at hand")
 def test_the_recordings_of_real_motors_are_read():
     path = DATA / "prbs_gearmotor" / "prbs_2026-08-14.csv"
     record = read_records(path, MAP)["motor"]

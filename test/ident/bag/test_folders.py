@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Folders of bags, and bags of several files, as recordings or experiments."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest
@@ -91,13 +89,8 @@ def test_fewer_messages_than_the_metadata_count_are_named(tmp_path):
     bag = tmp_path / "bag"
     bag.mkdir()
     write_sqlite(bag / "bag_0.db3", truth.messages())
-    write_metadata(
-        bag,
-        ["bag_0.db3"],
-        truth.messages(),
-        storage="sqlite3",
-        counts={"/front_left/motor_state": 1234},
-    )
+    counts = {"/front_left/motor_state": 1234}
+    write_metadata(bag, ["bag_0.db3"], truth.messages(), storage="sqlite3", counts=counts)
     assert "200 of 1234 messages could be read" in notes(read_records(bag)["front_left"])
 
 

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Every format a bag may come in, made by other libraries, reads as the same record."""
 
-from __future__ import annotations
-
 import gc
 import shutil
 import sqlite3
@@ -34,11 +32,7 @@ from smp_motor_ident.bag import list_topics, read_records
 from smp_motor_ident.errors import BagError
 
 Pack = Callable[[bytes], bytes]
-PACKERS: dict[str, Pack] = {
-    "plain": bytes,
-    "zstd": zstd.compress,
-    "lz4": lz4.frame.compress,
-}
+PACKERS: dict[str, Pack] = {"plain": bytes, "zstd": zstd.compress, "lz4": lz4.frame.compress}
 
 
 @pytest.mark.parametrize("pack", PACKERS)
@@ -66,13 +60,9 @@ def test_files_compressed_as_a_whole_are_read(tmp_path, storage, pack, bare):
         file.write_bytes(PACKERS[pack](plain.read_bytes()))
         plain.unlink()
     if not bare:
-        write_metadata(
-            bag,
-            [file.name],
-            truth.messages(),
-            storage="mcap" if storage == "mcap" else "sqlite3",
-            compression=(pack, "FILE") if pack != "plain" else ("", ""),
-        )
+        compression = (pack, "FILE") if pack != "plain" else ("", "")
+        kind = "mcap" if storage == "mcap" else "sqlite3"
+        write_metadata(bag, [file.name], truth.messages(), storage=kind, compression=compression)
     records = read_records(file if bare else bag)
     assert_read(records["front_left"], truth)
 
@@ -82,16 +72,12 @@ def test_files_compressed_as_a_whole_are_read(tmp_path, storage, pack, bare):
 @pytest.mark.parametrize("indexed", [True, False])
 def test_chunks_of_every_compression_are_read(tmp_path, compression, chunked, indexed):
     truth, other = motion(seed=2), motion(wheel="rear_left", seed=3)
+    summary = ("repeat_channels", "repeat_schemas", "use_statistics")
     path = write_mcap(
-        tmp_path / "bag.mcap",
-        merged(truth, other),
-        compression=compression,
-        use_chunking=chunked,
+        tmp_path / "bag.mcap", merged(truth, other), compression=compression, use_chunking=chunked,
         index_types=mcap.writer.IndexType.ALL if indexed else mcap.writer.IndexType.NONE,
-        repeat_channels=indexed,
-        repeat_schemas=indexed,
-        use_statistics=indexed,
-    )
+        **dict.fromkeys(summary, indexed),
+    )  # fmt: skip
     records = read_records(path)
     assert_read(records["front_left"], truth)
     assert_read(records["rear_left"], other)
@@ -176,15 +162,9 @@ def test_messages_that_only_the_journal_holds_are_read(tmp_path):
 def test_a_message_that_changed_between_distributions_is_read_by_the_fitting_definition(tmp_path):
     # Range of Foxy has no field `variance`; the bag does not define it.
     whole = serialized(
-        "sensor_msgs/msg/Range",
-        header=header(START, "x"),
-        radiation_type=0,
-        field_of_view=1.0,
-        min_range=0.0,
-        max_range=9.0,
-        range=0.5,
-        variance=7.0,
-    )
+        "sensor_msgs/msg/Range", header=header(START, "x"), radiation_type=0, field_of_view=1.0,
+        min_range=0.0, max_range=9.0, range=0.5, variance=7.0,
+    )  # fmt: skip
     sent = [
         Sent("/range", "sensor_msgs/msg/Range", START + k * 10_000_000, whole[:-4])
         for k in range(10)

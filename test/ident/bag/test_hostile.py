@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Hostile files are refused in one line within 30 s and 1 GB."""
 
-from __future__ import annotations
-
 import pytest
 from bench_scripts import load
 

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """A voltage that is recorded after it acts is moved back; one that leads its motion is not."""
 
-from __future__ import annotations
-
 import time
 
 import numpy as np

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The mapping's grammar, on the command line and in YAML."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
@@ -20,10 +18,8 @@ from smp_motor_ident.errors import BagError
         ("voltage=/x.data-127*12/128", Signal("/x", "data", 1.0, -127 * 12 / 128)),
         ("voltage=/x.data*2e-3 + .5:mV", Signal("/x", "data", 2e-3, 0.5, "mV")),
         ("voltage=/x.data:%", Signal("/x", "data", 1.0, 0.0, "%")),
-        (
-            "velocity=/joint_states.velocity[left_wheel_joint]:RPM@motor",
-            Signal("/joint_states", "velocity[left_wheel_joint]", 1.0, 0.0, "rpm", "motor"),
-        ),
+        ("velocity=/js.velocity[left_wheel]:RPM@motor",
+         Signal("/js", "velocity[left_wheel]", 1.0, 0.0, "rpm", "motor")),
         ("velocity=y:deg/s", Signal("", "y", 1.0, 0.0, "deg/s")),
         ("velocity=Motor_Speed(RPM):rpm", Signal("", "Motor_Speed(RPM)", 1.0, 0.0, "rpm")),
         ('velocity="left-wheel speed"*2', Signal("", "left-wheel speed", 2.0, 0.0)),
@@ -34,7 +30,7 @@ from smp_motor_ident.errors import BagError
         ("count=/enc.ticks:counts", Signal("/enc", "ticks", 1.0, 0.0, "ticks")),
         ("time=Timestamp(ms):ms", Signal("", "Timestamp(ms)", 1.0, 0.0, "ms")),
     ],
-)
+)  # fmt: skip
 def test_a_signal_is_read_from_its_text(text, signal):
     name = text.partition("=")[0]
     mapping = parse([text])
@@ -42,12 +38,8 @@ def test_a_signal_is_read_from_its_text(text, signal):
     found = signals[name]
     assert found.scale == pytest.approx(signal.scale, rel=1e-15)
     assert found.offset == pytest.approx(signal.offset, rel=1e-15)
-    assert (found.topic, found.field, found.unit, found.shaft) == (
-        signal.topic,
-        signal.field,
-        signal.unit,
-        signal.shaft,
-    )
+    for name in ("topic", "field", "unit", "shaft"):
+        assert getattr(found, name) == getattr(signal, name)
 
 
 def test_the_same_is_written_in_yaml_and_on_the_command_line(tmp_path):
@@ -106,17 +98,10 @@ def test_invalid_values_are_named_with_the_valid_ones(item, reason):
 
 @pytest.mark.parametrize(
     "text",
-    [
-        "[1, 2]",
-        "motors: 3",
-        "motors: {left: 3}",
-        "motors: {left: {voltage: {topic: /a}}}",
-        "motors: {left: {voltage: {topic: /a, field: b, unti: V}}}",
-        "types: {a: 1}",
-        ":\n  - {",
-        "\tx: 1",
-    ],
-)
+    ["[1, 2]", "motors: 3", "motors: {left: 3}", "motors: {left: {voltage: {topic: /a}}}",
+     "motors: {left: {voltage: {topic: /a, field: b, unti: V}}}", "types: {a: 1}",
+     ":\n  - {", "\tx: 1"],
+)  # fmt: skip
 def test_a_file_that_is_not_a_mapping_is_refused_by_its_name(tmp_path, text):
     file = tmp_path / "map.yaml"
     file.write_text(text)

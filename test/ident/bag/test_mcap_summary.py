@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The summary at the end of an MCAP file, which says what the file holds and where."""
 
-from __future__ import annotations
-
 import struct
 import subprocess
 import sys

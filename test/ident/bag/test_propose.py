@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Proposed mappings have signals that behave according to their names, and can be read."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -14,6 +12,7 @@ from recordings import (
     TYPES,
     Sent,
     floats,
+    follow,
     in_order,
     joint_state,
     serialized,
@@ -31,10 +30,7 @@ def motor(seed: int) -> tuple[np.ndarray, np.ndarray]:
     """Return voltage and speed of a first-order motor with noise, 20 rad/s/V and 0.1 s."""
     rng = np.random.default_rng(seed)
     voltage = np.repeat(rng.uniform(-6, 6, N // 20), 20)
-    speed = np.zeros(N)
-    for k in range(1, N):
-        speed[k] = speed[k - 1] + (1 - np.exp(-0.1)) * (20 * voltage[k - 1] - speed[k - 1])
-    return voltage, speed + rng.normal(0, 0.5, N)
+    return voltage, follow(voltage) + rng.normal(0, 0.5, N)
 
 
 def write(path: Path, **columns: Sequence[float]) -> Path:
@@ -67,10 +63,7 @@ def test_a_bag_of_two_wheels_is_mapped_and_the_pwms_full_scale_asked_for(tmp_pat
         "right.voltage=/right/pwm.data:pwm",
         "right.velocity=/joint_states.velocity[right_wheel]",
     ]
-    assert [text.partition("=")[0] for text in listing.asked] == [
-        "pwm_full_scale",
-        "supply_voltage",
-    ]
+    assert asked(listing) == ["pwm_full_scale", "supply_voltage"]
     given = [*listing.suggestion, "pwm_full_scale=32767", "supply_voltage=12"]
     records = read_records(tmp_path / "bag.mcap", given)
     np.testing.assert_allclose(records["right"].velocity, z)
@@ -84,12 +77,10 @@ def test_a_bag_of_two_wheels_is_mapped_and_the_pwms_full_scale_asked_for(tmp_pat
         (("Zeit", "Spannung", "Drehzahl"), ["voltage=Spannung", "velocity=Drehzahl:rpm"]),
         (("tiempo", "tension", "velocidad"), ["voltage=tension", "velocity=velocidad"]),
         (("时间", "电压", "速度"), ["voltage=电压", "velocity=速度"]),
-        (
-            ("time [s]", "u [mV]", "speed [rpm]"),
-            ['voltage="u [mV]":mV', 'velocity="speed [rpm]":rpm'],
-        ),
+        (("time [s]", "u [mV]", "speed [rpm]"),
+         ['voltage="u [mV]":mV', 'velocity="speed [rpm]":rpm']),
     ],
-)
+)  # fmt: skip
 def test_names_of_other_languages_and_units_in_brackets_are_understood(tmp_path, names, suggestion):
     path = write(tmp_path / "log.csv", **dict(zip(names, (T, *motor(3)))))
     assert list_topics(path)[0].suggestion[:2] == suggestion
@@ -196,9 +187,7 @@ def test_fields_that_behave_according_to_their_names_are_proposed(tmp_path, name
 
 
 @pytest.mark.parametrize(("seed", "columns", "remark"), NOT_PROPOSED)
-def test_nothing_is_proposed_where_no_voltage_moves_a_motion_and_why_is_told(
-    tmp_path, seed, columns, remark
-):
+def test_nothing_is_proposed_where_no_voltage_moves_a_motion(tmp_path, seed, columns, remark):
     listing = list_topics(write(tmp_path / "log.csv", **columns(*motor(seed))))[0]
     assert listing.suggestion == [] and listing.remark.split(". ")[0] == remark
 
@@ -226,7 +215,7 @@ def test_a_mapping_of_the_rim_asks_for_the_wheels_radius(tmp_path):
     path = write(tmp_path / "log.csv", **dict(zip(("t", "u", "speed (m/s)"), (T, *motor(9)))))
     listing = list_topics(path)[0]
     assert listing.suggestion[1] == 'velocity="speed (m/s)":m/s'
-    assert [text.partition("=")[0] for text in listing.asked] == ["wheel_radius"]
+    assert asked(listing) == ["wheel_radius"]
     assert len(read_records(path, [*listing.suggestion, "wheel_radius=0.05"])["motor"]) == N
 
 

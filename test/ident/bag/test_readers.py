@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Formats other than bags of ROS 2, from files written by other software."""
 
-from __future__ import annotations
-
 import io
 import json
 import struct
@@ -253,9 +251,7 @@ RATE = SPEED / (2 * np.pi)  # rotations a second
         ("Inches", 2 * np.pi * 0.076 / 0.0254, ["wheel_radius=0.076"]),
     ],
 )
-def test_rotations_of_sysid_are_converted_by_its_units_per_rotation(
-    tmp_path, units, per_rotation, mapping
-):
+def test_sysid_rotations_are_converted_to_radians(tmp_path, units, per_rotation, mapping):
     # docs/data-collection.md: "all positions and velocities should be in rotations"
     path = tmp_path / "sysid.json"
     sysid(path, [TIME, VOLTAGE, TURNS, RATE], units=units, unitsPerRotation=per_rotation)

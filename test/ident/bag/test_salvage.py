@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Rows recovered from the pages of a SQLite file, compared with those written by sqlite3."""
 
-from __future__ import annotations
-
 import random
 import sqlite3
 from pathlib import Path
@@ -36,17 +34,8 @@ def drawn(page_size: int, seed: int, count: int = 60) -> list[Row]:
     """Rows whose bytes fill a page, a little less and more, and several pages."""
     draw = random.Random(seed)
     around = page_size - 35  # the largest that is kept within a page, with its header
-    sizes = [
-        0,
-        1,
-        5,
-        57,
-        58,
-        100,
-        *range(around - 20, around + 4),
-        2 * page_size,
-        5 * page_size + 7,
-    ]
+    sizes = [0, 1, 5, 57, 58, 100, *range(around - 20, around + 4), 2 * page_size,
+             5 * page_size + 7]  # fmt: skip
     rows = []
     for k in range(1, count):
         key, data = draw.choice((k, 200 + k, 2**35 + k, 2**62 + k)), draw.choice(sizes)

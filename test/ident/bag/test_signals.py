@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Any numeric field of any message becomes a signal in SI at the motor shaft."""
 
-from __future__ import annotations
-
 import math
 from typing import Any
 
@@ -299,9 +297,7 @@ def test_units_scales_and_shafts_come_out_in_si_at_the_motor(tmp_path):
         ("voltage=/u.data velocity=/w.data clock=header", "no usable header time"),
     ],
 )
-def test_a_mapping_that_does_not_fit_is_refused_with_the_available_fields(
-    tmp_path, mapping, reason
-):
+def test_an_unfit_mapping_is_refused_with_the_available_fields(tmp_path, mapping, reason):
     messages = in_order(even("/u", [1.0] * 9), even("/w", [60.0] * 9))
     path = write_mcap(tmp_path / "bag.mcap", messages)
     with pytest.raises(BagError) as refused:

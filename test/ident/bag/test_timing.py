@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Time: which clock, order, losses, gaps, wrap-around and held inputs."""
 
-from __future__ import annotations
-
 import dataclasses
 from typing import Any
 

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The delay of a loop, measured from bags of loops whose delay is known."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from pathlib import Path

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """A recording cut off at any byte gives its whole messages and a finding on the loss."""
 
-from __future__ import annotations
-
 import sqlite3
 from pathlib import Path
 

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Decompression of all kinds, with several frames or cut off, and its limit."""
 
-from __future__ import annotations
-
 import bz2
 import math
 import random

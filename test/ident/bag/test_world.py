@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Tables in the forms of many loggers, each with the same 300 samples."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The bag writer: what ros2 bag and rosbags expect, at every moment."""
 
-from __future__ import annotations
-
 import threading
 import tracemalloc
 
@@ -60,8 +58,6 @@ def test_the_file_is_indexed_and_checked_by_the_mcap_library(tmp_path):
     with (tmp_path / "bag" / "bag_0.mcap").open("rb") as file:
         reader = make_reader(file, validate_crcs=True)
         summary = reader.get_summary()
-        assert summary is not None
-        assert summary.statistics is not None
         assert summary.statistics.message_count == 100
         assert len(summary.chunk_indexes) == summary.statistics.chunk_count >= 10
         data = [message.data for _, _, message in reader.iter_messages()]
