@@ -72,13 +72,8 @@ def test_limits_that_are_not_given_are_accepted(case, absent):
 
 @cases("inverse_kinematics_cases")
 def test_body_velocity_becomes_wheel_speeds_and_back(case):
-    names = (
-        "wheel_separation",
-        "wheel_separation_multiplier",
-        "wheel_radius",
-        "left_wheel_radius_multiplier",
-        "right_wheel_radius_multiplier",
-    )
+    names = ("wheel_separation", "wheel_separation_multiplier", "wheel_radius",
+             "left_wheel_radius_multiplier", "right_wheel_radius_multiplier")  # fmt: skip
     robot = SkidSteer(**{name: case[name] for name in names})
     left, right = robot.wheel_speeds(case["linear_x"], case["angular_z"])
     assert left == pytest.approx(case["expect_left"], abs=case["abs_tol"])

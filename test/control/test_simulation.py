@@ -35,13 +35,8 @@ def settings_of(wheel: str, **changes) -> LoopSettings:
         feedforward_velocity=ratio * p.a0,
         feedforward_acceleration=ratio * p.a1,
     )
-    values = {
-        "gains": gains,
-        "transition_time": 0.2,
-        "model": MotorModel(**combinations_of(p)),
-        **changes,
-    }
-    return LoopSettings(**values)
+    model = MotorModel(**combinations_of(p))
+    return LoopSettings(**{"gains": gains, "transition_time": 0.2, "model": model, **changes})
 
 
 def test_open_loop_reaches_the_gain_of_the_motor():

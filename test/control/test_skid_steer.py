@@ -36,12 +36,8 @@ def test_command_within_reach_is_not_touched():
 
 
 def test_radius_multipliers_act_on_their_side():
-    robot = SkidSteer(
-        wheel_separation=0.4,
-        wheel_radius=0.1,
-        left_wheel_radius_multiplier=0.5,
-        right_wheel_radius_multiplier=2.0,
-    )
+    robot = SkidSteer(wheel_separation=0.4, wheel_radius=0.1, left_wheel_radius_multiplier=0.5,
+                      right_wheel_radius_multiplier=2.0)  # fmt: skip
     assert robot.wheel_speeds(1.0, 0.0) == pytest.approx((20.0, 5.0))
 
 

@@ -110,13 +110,9 @@ def test_rest_before_the_excitation_changes_nothing():
     driven = motors.record("rear_left", current=False, seconds=3.0)
     n = 4000
     t = np.arange(n + len(driven)) / 200.0
-    rested = replace(
-        driven,
-        time=t,
-        voltage=np.r_[np.zeros(n + 1), driven.voltage[1:]],  # a row holds what ran up to it
-        velocity=np.r_[np.zeros(n), driven.velocity],
-        count=np.r_[np.full(n, driven.count[0]), driven.count],
-    )
+    volts = np.r_[np.zeros(n + 1), driven.voltage[1:]]  # a row holds what ran up to it
+    rested = replace(driven, time=t, voltage=volts, velocity=np.r_[np.zeros(n), driven.velocity],
+                     count=np.r_[np.full(n, driven.count[0]), driven.count])  # fmt: skip
     with_it, without = estimate(rested), estimate(driven)
     assert with_it.model == without.model
     for name in ("dc_gain", "time_constant", "static_voltage"):
@@ -130,14 +126,9 @@ def test_the_scatter_of_an_angle_at_rest_is_not_motion():
     turn = 2 * np.pi / driven.hardware.counts_per_revolution
     moved = np.r_[np.zeros(n), (driven.count - driven.count[0]) * turn]
     scatter = 0.1 * np.abs(np.diff(moved)).max()
-    rested = replace(
-        driven,
-        time=np.arange(moved.size) / 200.0,
-        voltage=np.r_[np.zeros(n), driven.voltage],
-        velocity=None,
-        count=None,
-        position=moved + scatter * rng.standard_normal(moved.size),
-    )
+    position = moved + scatter * rng.standard_normal(moved.size)
+    time, volts = np.arange(moved.size) / 200.0, np.r_[np.zeros(n), driven.voltage]
+    rested = replace(driven, time=time, voltage=volts, velocity=None, count=None, position=position)
     assert np.diff(excitation(rested))[0] < 1.1 * len(driven)
     found = estimate(rested).combinations["dc_gain"]
     truth = estimate(driven).combinations["dc_gain"]

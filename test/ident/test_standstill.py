@@ -51,12 +51,8 @@ def test_a_motor_at_rest_with_a_noisy_angle_is_refused_despite_its_current():
     current = np.zeros(voltage.size)
     for k in range(1, voltage.size):  # a row's voltage ran before it
         current[k] = decay * current[k - 1] + (1 - decay) * voltage[k] / resistance
-    record = Record(
-        "w",
-        step * np.arange(voltage.size),
-        voltage,
-        position=1e-3 * rng.standard_normal(voltage.size),
-        current=current + 1e-4 * rng.standard_normal(voltage.size),
-    )
+    position = 1e-3 * rng.standard_normal(voltage.size)
+    noisy = current + 1e-4 * rng.standard_normal(voltage.size)
+    record = Record("w", step * np.arange(voltage.size), voltage, noisy, position=position)
     with pytest.raises(InsufficientExcitationError, match="the motor is at rest"):
         estimate(record)

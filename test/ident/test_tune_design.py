@@ -151,12 +151,10 @@ def test_impossible_demand_is_refused_with_the_limit(targets, words):
     [
         (Loop(sample_time=1e-5, delay=0.5), "Sample at 600 Hz or less"),
         (Loop(difference_window=1000), "average over fewer samples"),
-        (
-            Loop(supply_voltage=1e-3),
-            "the nearest that holds has a control_noise of|no similar design",
-        ),
+        (Loop(supply_voltage=1e-3),
+         "the nearest that holds has a control_noise of|no similar design"),
     ],
-)
+)  # fmt: skip
 def test_an_impossible_loop_is_refused_with_advice(loop, words):
     with pytest.raises(DesignError, match=words):
         design(estimate(), loop)

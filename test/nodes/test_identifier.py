@@ -12,9 +12,7 @@ TRUE_GAIN = 25.548
 """Of motor 1, K / (R b + K^2) of Table 1 [rad/s/V]."""
 
 
-def test_it_demands_motion_before_it_names_a_number_and_then_names_the_right_one(
-    process, robot, eventually
-):
+def test_values_appear_after_enough_motion_and_are_right(process, robot, eventually):
     heard: list[MotorParameters] = []
     latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
     robot.node.create_subscription(

@@ -76,9 +76,7 @@ def listener(node: Node) -> Iterator[Listener]:
     made.close()
 
 
-def test_play_sends_the_recorded_bytes_at_their_times_and_they_are_recorded_again(
-    process, listener, eventually, tmp_path
-):
+def test_play_repeats_bytes_and_times(process, listener, eventually, tmp_path):
     written = write_bag(tmp_path / "bag")
     recorder = process("record", "-o", tmp_path / "again", "--regex", "/number|/text")
     eventually(lambda: "recording to" in recorder.output, deadline=20.0)
@@ -95,9 +93,7 @@ def test_play_sends_the_recorded_bytes_at_their_times_and_they_are_recorded_agai
     assert contents(tmp_path / "again") == written
 
 
-def test_play_goes_faster_from_an_offset_with_a_clock_and_chosen_topics(
-    process, listener, tmp_path
-):
+def test_play_has_a_rate_an_offset_a_clock_and_topics(process, listener, tmp_path):
     written = write_bag(tmp_path / "bag")
     arguments = ("--rate", "0.5", "--start-offset", "0.5", "--clock", "100", "--topics", "number")
     arguments += UNHURRIED
@@ -139,9 +135,7 @@ def test_play_refuses_invalid_arguments_in_one_line(process, tmp_path, arguments
     assert "Traceback" not in player.output
 
 
-def test_types_that_cannot_be_played_are_told_and_the_other_messages_played(
-    process, listener, eventually, tmp_path
-):
+def test_play_names_types_that_it_leaves_out(process, listener, eventually, tmp_path):
     bag = tmp_path / "odd.mcap"
     with bag.open("wb") as file:
         writer = mcap.writer.Writer(file)

@@ -26,9 +26,7 @@ from smp_motor_ident.errors import BagError
 
 
 @pytest.mark.parametrize("ending", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL])
-def test_four_wheels_at_a_kilohertz_are_recorded_without_a_lost_message(
-    node, process, eventually, tmp_path, ending
-):
+def test_no_message_of_four_wheels_at_1_khz_is_lost(node, process, eventually, tmp_path, ending):
     bag = tmp_path / "bag"
     publishers = [node.create_publisher(MotorState, f"/{w}/motor_state", RELIABLE) for w in WHEELS]
     recorder = process("record", "--output", bag)
@@ -84,9 +82,7 @@ def test_best_effort_messages_are_recorded_or_told_as_lost(node, process, eventu
         assert lost == (int(said[1]) if said else 0)
 
 
-def test_late_publishers_latched_ones_and_mixed_qos_are_recorded(
-    node, process, eventually, tmp_path
-):
+def test_late_latched_and_mixed_publishers_are_recorded(node, process, eventually, tmp_path):
     bag = tmp_path / "bag"
     description = node.create_publisher(MotorDescription, "/w/motor_description", LATCHED)
     description.publish(MotorDescription(joint_name="early", gear_ratio=65.5))

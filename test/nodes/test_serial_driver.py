@@ -181,9 +181,7 @@ def robot(node: Node) -> Any:
 
 # 36 V in 16 bits are -29536 mV; a divider may show anything.
 @pytest.mark.parametrize("battery", [-12000, -29536, -1, 65535, 10**17, 0, 40, ""])
-def test_no_supply_that_a_board_reports_turns_zero_into_motion(
-    board, robot, driver, eventually, battery
-):
+def test_no_reported_supply_turns_zero_into_motion(board, robot, driver, eventually, battery):
     board.battery = battery
     started = driver()
     eventually(lambda: len(board.obeyed) > 30, 20.0, robot.drive, started.output)
@@ -215,9 +213,7 @@ def test_a_suspended_board_gets_few_outdated_commands(board, robot, driver, even
     assert board.obeyed[stale:] == [[0.0, 0.0]] * (len(board.obeyed) - stale)
 
 
-def test_every_command_follows_the_clock_of_the_sample_that_it_answers(
-    board, robot, driver, eventually
-):
+def test_commands_follow_the_clock_of_their_sample(board, robot, driver, eventually):
     told: list[tuple[int, float]] = []
 
     def listen(lines: LineSplitter, now: float) -> None:

@@ -26,9 +26,7 @@ NODES = {
 MISSING = "/clock is not published"
 
 
-def test_a_missing_clock_is_named_by_every_node_and_a_present_one_followed(
-    process, node, eventually
-):
+def test_every_node_names_a_missing_clock_and_follows_one(process, node, eventually):
     said: dict[str, str] = {}
 
     def listen(message: DiagnosticArray) -> None:

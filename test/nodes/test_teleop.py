@@ -197,9 +197,7 @@ def test_leaving_stops_the_robot_and_restores_the_terminal(ready, robot, eventua
     assert "Traceback" not in shell.shown
 
 
-def test_suspending_stops_and_restores_and_continuing_takes_the_keys_again(
-    ready, robot, eventually
-):
+def test_suspending_stops_and_continuing_takes_the_keys(ready, robot, eventually):
     shell = ready()
     hold("w", shell, robot, lambda: robot.linear() == 0.2, eventually)
     shell.type("\x1a")

@@ -94,9 +94,7 @@ def test_one_pid_step_per_sample_with_dt_from_the_stamps(start, robot, eventuall
         before, last = after, dt
 
 
-def test_feedback_that_is_duplicated_old_or_nonsense_is_left_out_and_named(
-    start, robot, eventually
-):
+def test_duplicated_old_or_invalid_feedback_is_left_out(start, robot, eventually):
     start("p:=2.0", "setpoint_timeout:=30.0")
     feed = Feed(robot, eventually)
     settle(robot, feed)
@@ -264,9 +262,7 @@ def real_time_is_granted() -> bool:
     return subprocess.run([sys.executable, "-c", asked], capture_output=True).returncode == 0
 
 
-def test_priority_and_processor_hold_for_all_threads_or_their_refusal_is_told(
-    start, robot, eventually
-):
+def test_priority_and_processor_hold_for_all_threads(start, robot, eventually):
     processor = min(os.sched_getaffinity(0))
     node = start("scheduling_priority:=10", f"cpu_affinity:=[{processor}]")
     settle(robot, Feed(robot, eventually))

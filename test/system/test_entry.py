@@ -27,9 +27,7 @@ def has_mapped(pid: int, library: str) -> bool:
         ("tune none.json", 130),
     ],
 )
-def test_ctrl_c_while_importing_ends_an_executable_without_a_traceback(
-    process, eventually, command, code
-):
+def test_ctrl_c_while_importing_ends_without_a_traceback(process, eventually, command, code):
     started = process(*command.split())
     # numpy is among the first that is imported, and far from the last
     eventually(
