@@ -205,7 +205,7 @@ def main() -> int:
         old, new, bad = compared(before[name][key], found[name][key], SIZE / len(rows))
         worse += bad
         print(f"{name:11} {key:55} {old:>20} {new:>20}  {'WORSE' if bad else 'holds'}")
-    print(f"{worse} of {len(rows)} worse than before the redesign, beyond chance of {SIZE:.0%}")
+    print(f"{worse} of {len(rows)} worse than before, beyond chance of {100 * SIZE:.0f} %")
     return int(worse > 0)
 
 

@@ -105,8 +105,8 @@ def main() -> None:
              sum(x["says"] == "refused" for x in here), len(wrong),
              f"{1e3 * np.median([x['seconds'] for x in here]):.0f} ms")
         )  # fmt: skip
-    head = ("case", f"gain and lag within {NEAR:.0%}", "else said so", "unreliable", "refused",
-            f"sure, yet off by > {FAR:g} std", "median processor time")  # fmt: skip
+    head = ("case", f"gain and lag within {100 * NEAR:.0f} %", "else said so", "unreliable",
+            "refused", f"sure, yet off by > {FAR:g} std", "median processor time")  # fmt: skip
     print("\n" + table(head, rows))
 
 

@@ -37,7 +37,7 @@ RIGHT: dict[str, tuple[bool, str]] = {
     "wrong gear ratio": (False, "gear_ratio"),
     "dead zone": (True, "dead_zone"),
     "weak battery": (False, "supply_low"),
-    "load on one wheel": (False, "unlike_sisters"),
+    "load on one wheel": (False, "friction_outlier"),
 }
 """By case whether gains may pass, and the finding, of the spoilt wheel, that else is the reason."""
 

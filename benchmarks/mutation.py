@@ -183,7 +183,9 @@ class Campaign:
         killed = len(chosen) - lived
         self.share = share = killed / max(len(chosen), 1)
         took = time.monotonic() - begin
-        print(f"{name}: {killed} of {len(chosen)} mutants killed, {share:.1%}, {took:.0f} s")
+        print(
+            f"{name}: {killed} of {len(chosen)} mutants killed, {100 * share:.1f} %, {took:.0f} s"
+        )
         return True
 
 

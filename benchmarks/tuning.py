@@ -285,7 +285,7 @@ def table(outcomes: list[Outcome]) -> None:
         for rule in ("simc", "ziegler_nichols"):
             found = [o.faster[rule] for o in outcomes if o.rate == rate and o.faster]
             for k, share in enumerate(SHARES):
-                row(rate, rule, f"{share:.0%}", np.array([t[k][0] for t in found]), 1.3,
+                row(rate, rule, f"{100 * share:.0f} %", np.array([t[k][0] for t in found]), 1.3,
                     np.mean([t[k][1] >= 1.3 for t in found]))  # fmt: skip
             row(rate, rule, "load", np.array([t[-1] for t in found]), 1.0, 1.0)
 
@@ -295,7 +295,7 @@ def row(rate, rule, name, ratios, enough, possible) -> None:
     print(
         f"{rate:6g}  {rule:16s}  {name:>4s}   {np.median(ratios):6.2f} "
         f"{np.quantile(ratios, 0.1):6.2f} {ratios.min():6.2f}   "
-        f"{np.mean(ratios >= enough):22.1%}  {possible:.1%}"
+        f"{100 * np.mean(ratios >= enough):21.1f} %  {100 * possible:.1f} %"
     )
 
 

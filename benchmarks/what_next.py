@@ -67,8 +67,8 @@ def main() -> None:
             rows.append(
                 (wheel, f"{proposal.amplitude:.3g} V, {proposal.band[0]:.2g} to "
                  f"{proposal.band[1]:.2g} Hz, {proposal.duration:.0f} s", name,
-                 f"{predicted:.3%}", f"{np.median(stated[name]):.3%}",
-                 f"{np.sqrt(np.mean(np.square(errors[name]))):.3%}")
+                 f"{100 * predicted:.3f} %", f"{100 * np.median(stated[name]):.3f} %",
+                 f"{100 * np.sqrt(np.mean(np.square(errors[name]))):.3f} %")
             )  # fmt: skip
     head = ("motor", "proposal", "parameter", "predicted std", "std then stated", "rms error then")
     print(table(head, rows))

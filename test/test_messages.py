@@ -18,6 +18,7 @@ FAULTS = {
     # In words: "resistance", "DC gain"; names to type, such as parameters, keep their underscores.
     "a quantity in code": r"(?<!\.)\b(dc_gain|time_constant|static_voltage|\w+_friction)\b",
     "a number without unit": r"\b(at|about|for|in|every|within|reaches) N(?! [A-Za-z%…])",
+    "a percent sign without a space": r"[N\d]%",
     "an obscure phrase": r"\b(what (is|the|it)|of which|beside|is none|are no|(?<!there )is no)\b",
 }  # fmt: skip
 

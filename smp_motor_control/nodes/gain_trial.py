@@ -76,7 +76,7 @@ class LoopWatch:
             return f"its output swings by {swing:.2g} V from step to step"
         clamped = sum(s.saturated for s in states) / len(states)
         if clamped > 0.5:
-            return f"its output is clamped {clamped:.0%} of the time"
+            return f"its output is clamped {100 * clamped:.0f} % of the time"
         if any(max(s.dt, s.age) > STARVED_RATIO * self.usual_dt for s in states):
             return None  # the computer's delays, not the gains, affect the speed
         error = _rms([s.error for s in states])

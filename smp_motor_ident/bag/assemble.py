@@ -340,7 +340,7 @@ def _clamp_to_supply(motor: Motor, volts: Array, supply: float) -> Array:
         motor.tell(
             "beyond_full_scale",
             f"{beyond} samples of the command are beyond 100 % (up to "
-            f"{np.nanmax(np.abs(volts)) / supply:.0%}) and were clamped to it; give the "
+            f"{100 * np.nanmax(np.abs(volts)) / supply:.0f} %) and were clamped to it; give the "
             "pwm_full_scale that is 100 %, and write codes such as a brake command as 0",
             "warning",
             samples=beyond,

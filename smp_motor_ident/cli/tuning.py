@@ -270,8 +270,8 @@ def tell_delays(
 
 
 HEAD = (
-    f"  {'method':16s} {'p':>8} {'i':>8} {'d':>8} {'PM':>4} {'GM':>6} {'Ms':>5} {'settle':>7} "
-    f"{'over':>5} {'load':>8} {'volts':>6} {'noise':>6}"
+    f"  {'method':16s} {'p':>8} {'i':>8} {'d':>8} {'PM':>4} {'GM':>6} {'Ms':>5} {'settle':>8} "
+    f"{'over':>6} {'load':>8} {'volts':>7} {'noise':>7}"
 )
 """Of a table of designs."""
 
@@ -283,8 +283,8 @@ def row(result: Design | DesignError) -> str:
     g, m, f = result.gains, result.margins, result.performance
     return (
         f"{g.p:8.3g} {g.i:8.3g} {g.d:8.3g} {m.phase:4.0f} {m.gain:6.3g} {m.sensitivity:5.2f} "
-        f"{1e3 * f.settling:5.0f}ms {f.overshoot:4.1f}% {f.load_integral:8.3g} "
-        f"{f.peak_voltage:5.2f}V {1e3 * f.control_noise:4.0f}mV"
+        f"{1e3 * f.settling:5.0f} ms {f.overshoot:4.1f} % {f.load_integral:8.3g} "
+        f"{f.peak_voltage:5.2f} V {1e3 * f.control_noise:4.0f} mV"
     )
 
 

@@ -237,8 +237,8 @@ def supply(robot: Robot) -> Iterator[Finding]:
         if 0 < one.applied < 1.0 - MAX_SUPPLY_SHORTFALL.value:
             yield Finding(
                 "supply_low", "refused",
-                f"{wheel}: gets {one.applied:.0%} of the commanded voltage, as from a battery of "
-                f"{one.applied * nominal:.3g} V in place of {nominal:g} V",
+                f"{wheel}: gets {100 * one.applied:.0f} % of the commanded voltage, as from a "
+                f"battery of {one.applied * nominal:.3g} V in place of {nominal:g} V",
                 {"wheel": wheel, "applied": one.applied, "nominal": _known(nominal)},
                 "charge or change the battery, or correct supply_voltage in motor_description",
             )  # fmt: skip
@@ -262,10 +262,10 @@ def compare_wheels(robot: Robot) -> Iterator[Finding]:
     # Without a known friction, the breakaway voltage is its upper bound.
     drag = {w: one.friction if one.friction > 0 else one.breakaway for w, one in figures.items()}
     yield from _compare_with_others(
-        drag, ("unlike_sisters", "refused"),
+        drag, ("friction_outlier", "refused"),
         "friction", "it drags, brakes, or is another motor",
         "turn it by hand and compare it with the others; free it where it rubs or touches the "
-        "ground. Give --accept unlike_sisters if it is meant to differ",
+        "ground. Give --accept friction_outlier if it is meant to differ",
     )  # fmt: skip
     yield from _compare_with_others(
         {w: one.coast for w, one in figures.items()}, ("coasts_longer", "warning"),
@@ -285,7 +285,7 @@ def _compare_with_others(
         if value > MAX_FRICTION_RATIO.value * usual:
             text = f"{wheel}: its {what} is {value / usual:.3g} times that of the others: {why}"
             evidence: dict[str, float | str | None] = {
-                "wheel": wheel, "value": value, "sisters": usual
+                "wheel": wheel, "value": value, "median": usual
             }  # fmt: skip
             yield Finding(*code, text, evidence, advice)
 

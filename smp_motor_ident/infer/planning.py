@@ -178,5 +178,6 @@ def _words(
         f"record {duration:.0f} s of a Fourier voltage of {amplitude:.3g} V peak with tones from "
         f"{band[0]:.2g} to {band[1]:.2g} Hz in both directions"
         + (", with the motor current measured" if needs_current else "")
-        + f": {reached} would be known within {accuracy:.2%} ({name} to {after[worst]:.2%})"
+        + f": {reached} would be known within {100 * accuracy:.2f} % "
+        f"({name} to {100 * after[worst]:.2f} %)"
     )

@@ -125,7 +125,7 @@ def over_real_intervals(record: Record) -> Record:
         "warning" if known else "unreliable",
         f"{words}: it was corrected for a period of {1e3 * period:.4g} ms"
         + ("" if known else f", the mean one; for {1e3 * shortest:.4g} ms it would be "
-           f"{1 - shortest / mean:.0%} less"),
+           f"{100 * (1 - shortest / mean):.0f} % less"),
         {"period": period, "shortest": shortest},
         "record the encoder's counts" + ("" if known else ", or map counts_per_revolution=N"),
     )  # fmt: skip

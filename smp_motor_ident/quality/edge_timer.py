@@ -44,7 +44,7 @@ def between_edges(record: Record) -> Record:
         "edge_timer",
         "warning",
         f"the speed is from the time of one count ({count:.3g} rad), held until the next: it lags "
-        f"at low speed; {share:.0%} of the readings were left out",
+        f"at low speed; {100 * share:.0f} % of the readings were left out",
         {"count": count, "share": share},
         "record the encoder's counts",
     )

@@ -53,7 +53,7 @@ def saturation(record: Record, speed: Array, where: str) -> Iterator[Finding]:
                 continue
             raise SignalError(
                 f"{where}: saturated sensor, {name} rests at {limit:.4g} {unit} in "
-                f"{share:.1%} of the samples while the voltage moves; widen its range or "
+                f"{100 * share:.1f} % of the samples while the voltage moves; widen its range or "
                 "lower the excitation"
             )
     if regulated:

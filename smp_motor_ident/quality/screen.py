@@ -85,7 +85,7 @@ def _lost(record: Record) -> Iterator[Finding]:
         lost -= held_of(record) if name == "velocity" else 0.0  # which is said already
         if lost > limits.MOST_LOST.value and (name == "velocity" or record.velocity is None):
             raise SignalError(
-                f"{where}: {name} is NaN in {lost:.0%} of the samples; "
+                f"{where}: {name} is NaN in {100 * lost:.0f} % of the samples; "
                 "repair the sensor or its connection and record again"
             )
         lost -= count_glitches(record, name) / len(record)  # which are said already
@@ -98,7 +98,7 @@ def _lost(record: Record) -> Iterator[Finding]:
 
 
 def _report_left_out(name: str, lost: float) -> Finding:
-    message = f"{name} is NaN in {lost:.1%} of the samples; they were left out"
+    message = f"{name} is NaN in {100 * lost:.1f} % of the samples; they were left out"
     return Finding("samples_lost", "warning", message, {"signal": name, "share": lost})
 
 

@@ -125,8 +125,8 @@ def refuse_lost_sign(records: Sequence[Record], speeds: Sequence[Array], where: 
     way, back = float(np.abs(ways).sum()), -float(np.minimum(ways, 0.0).sum())
     if lowest >= 0 and back > BACKWARD.value * way and way - back > BACKWARD.value * way:
         raise SignalError(
-            f"{where}: the voltage is never negative, though {back / way:.0%} of the way is "
-            "backwards: it has no sign; map its direction with direction=COLUMN, or record a "
+            f"{where}: the voltage is never negative, though {100 * back / way:.0f} % of the way "
+            "is backwards: it has no sign; map its direction with direction=COLUMN, or record a "
             "signed command"
         )
     if all(_size_of(r) for r in records):

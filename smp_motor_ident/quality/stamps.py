@@ -259,8 +259,8 @@ def merge_bunches(record: Record) -> Record:
     finding = Finding(
         "stamps_equal",
         "warning",
-        f"{share:.0%} of the samples have the stamp of the sample before; of samples that are "
-        "stamped alike the last was used",
+        f"{100 * share:.0f} % of the samples have the stamp of the sample before; of samples that "
+        "are stamped alike the last was used",
         {"share": share, "samples": float(kept.size)},
         "stamp each sample where it is measured, with a clock finer than the sampling interval",
     )

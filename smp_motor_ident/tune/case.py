@@ -167,7 +167,7 @@ def _check_reliability(estimate: Estimate, accepted: bool) -> tuple[Finding, ...
     spread = unreliable_spread(estimate)
     message = (
         f"designed on an unreliable identification ({words}): every parameter is assumed "
-        f"uncertain by at least {spread:.0%}"
+        f"uncertain by at least {100 * spread:.0f} %"
     )
     return (Finding("unreliable_identification", "unreliable", message, {"spread": spread}),)
 

@@ -164,9 +164,9 @@ def plan_reference(
         rate = steepest if rate is None else rate
         if rate > steepest:
             raise DesignError(
-                f"max_acceleration {rate / ratio:.4g} rad/s^2 is beyond the motor: a "
-                f"change by {plan.max_velocity / ratio:.3g} rad/s within {PEAK_VOLTAGE_SHARE:.0%} "
-                f"of {loop.supply_voltage:g} V reaches {steepest / ratio:.4g} rad/s^2; ask for "
+                f"max_acceleration {rate / ratio:.4g} rad/s^2 is beyond the motor: a change by "
+                f"{plan.max_velocity / ratio:.3g} rad/s within {100 * PEAK_VOLTAGE_SHARE:.0f} % of "
+                f"{loop.supply_voltage:g} V reaches {steepest / ratio:.4g} rad/s^2; ask for "
                 "that or less"
             )
         plan = replace(plan, max_acceleration=rate)
@@ -191,7 +191,7 @@ def _reachable(plant: Plant, loop: Loop, wished: float | None) -> float:
     if wished is not None and wished > top:
         raise DesignError(
             f"max_velocity {wished / ratio:.4g} rad/s is beyond the motor: "
-            f"{STEADY_VOLTAGE_SHARE:.0%} of {loop.supply_voltage:g} V reaches "
+            f"{100 * STEADY_VOLTAGE_SHARE:.0f} % of {loop.supply_voltage:g} V reaches "
             f"{top / ratio:.4g} rad/s; ask for that or less"
         )
     return 0.9 * top if wished is None else wished

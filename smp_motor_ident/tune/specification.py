@@ -96,8 +96,8 @@ class Settling:
         high = "not stated" if math.isnan(self.high) else f"{1e3 * self.high:.3g} ms"
         wheels = ", common to all wheels" if self.common else ""
         return (
-            f"settles within {self.tolerance:.0%} in {1e3 * self.value:.3g} ms (at most {high}) "
-            f"after a change of set-point by {self.change:.3g} rad/s, its planned transition of "
+            f"settles within {100 * self.tolerance:.0f} % in {1e3 * self.value:.3g} ms "
+            f"(at most {high}) after a change of set-point by {self.change:.3g} rad/s, its planned transition of "
             f"{1e3 * self.transition:.3g} ms included{wheels}; an abrupt change, by the feedback "
             f"alone, in {1e3 * self.abrupt:.3g} ms"
         )

@@ -62,7 +62,7 @@ BAD = {
     "NaN gaps": (
         replace(GOOD, count=None, velocity=alternate(GOOD.velocity)),
         SignalError,
-        "NaN in 60%",
+        "NaN in 60 %",
     ),
 }  # fmt: skip
 

@@ -167,17 +167,17 @@ def test_a_weak_battery_is_refused_by_what_arrives_or_what_it_says():
 
 
 def test_a_wheel_that_drags_is_separated_from_motors_that_scatter():
-    assert codes(replace(GOOD, friction=5 * FRICTION))["unlike_sisters"] == "refused"
+    assert codes(replace(GOOD, friction=5 * FRICTION))["friction_outlier"] == "refused"
     heavier = codes(replace(GOOD, coast=5 * GOOD.coast))
-    assert heavier["coasts_longer"] == "warning" and "unlike_sisters" not in heavier
-    assert "unlike_sisters" not in codes(replace(GOOD, friction=1.8 * FRICTION))
+    assert heavier["coasts_longer"] == "warning" and "friction_outlier" not in heavier
+    assert "friction_outlier" not in codes(replace(GOOD, friction=1.8 * FRICTION))
     # A load that leaves room for one level only: friction and gain cannot be separated.
     heavy = replace(GOOD, friction=math.nan, gain=math.nan, breakaway=3.3)
-    assert codes(heavy)["unlike_sisters"] == "refused"
+    assert codes(heavy)["friction_outlier"] == "refused"
     # Two wheels cannot tell which of them is the odd one.
     two = {"a": GOOD, "b": replace(GOOD, friction=9 * FRICTION)}
     found = judge(Robot(two, dict.fromkeys(two, HARDWARE)))
-    assert "unlike_sisters" not in {f.code for f in found}
+    assert "friction_outlier" not in {f.code for f in found}
 
 
 def test_the_voltage_grows_until_friction_is_a_tenth_and_counts_are_enough():

@@ -41,7 +41,7 @@ def export(
 
 def _settles(one: Check) -> str:
     if one.resting_error > SETTLING_BAND.value:
-        return f"rests within {one.resting_error:.1%} of it, as whole numbers allow"
+        return f"rests within {100 * one.resting_error:.1f} % of it, as whole numbers allow"
     if math.isnan(one.step.settling):
         return "does not settle within 2 %"
     return f"settles in {one.step.settling:.3g} s"

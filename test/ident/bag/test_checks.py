@@ -162,7 +162,7 @@ def test_a_driver_puts_out_no_more_than_its_supply(tmp_path):
     np.testing.assert_allclose(record.voltage[1:], np.clip(pwm / 255 * 12, -12, 12)[:-1])
     (found,) = (f for f in record.findings if f.code == "beyond_full_scale")
     assert found.evidence["samples"] == 10
-    assert "392%" in found.message
+    assert "392 %" in found.message
 
 
 def signed(folder: Path, direction: str) -> Path:
