@@ -33,7 +33,7 @@ os.environ.setdefault("DASK_DISTRIBUTED__WORKER__PROFILE__ENABLED", "False")
 
 from smp_motor_control.motor.file import load_motors  # noqa: E402
 from smp_motor_control.motor.friction import Motor  # noqa: E402
-from smp_motor_ident.bag import parse  # noqa: E402
+from smp_motor_ident.bag import parse_mapping  # noqa: E402
 from smp_motor_ident.cli import fleet  # noqa: E402
 
 STEP = 0.01
@@ -91,7 +91,7 @@ def main() -> int:
     parser.add_argument("--bags", type=int, default=200)
     parser.add_argument("--seconds", type=float, default=10.0, help="of each; default 10")
     given = parser.parse_args()
-    settings = (parse(["time=t", "voltage=u", "velocity=w"], []), "auto", {})
+    settings = (parse_mapping(["time=t", "voltage=u", "velocity=w"], []), "auto", {})
     with tempfile.TemporaryDirectory() as folder:
         paths = make(Path(folder), given.bags, given.seconds)
         fleet.identify_one(paths[0], settings)

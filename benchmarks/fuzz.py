@@ -50,7 +50,7 @@ from rosbags.rosbag1 import Writer as Ros1Writer
 from rosbags.typesys import Stores, get_typestore
 
 from smp_motor_control.parameter_file import format_parameters
-from smp_motor_ident.bag import list_topics, load, read_records
+from smp_motor_ident.bag import list_topics, load_mapping, read_records
 from smp_motor_ident.cli.tune import main as main_of_tune
 from smp_motor_ident.errors import BagError, SignalError
 
@@ -405,7 +405,7 @@ def outcome(name: str, data: bytes, folder: Path) -> str:
         target = folder
     try:
         if name == "mapping":
-            load(path)
+            load_mapping(path)
             return "answer"
         if name in ("identification", "motors"):
             return tuned(path)

@@ -10,30 +10,32 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from smp_motor_ident.bag.mapping import MotorMap, Signal, SignalMap, load, parse
-    from smp_motor_ident.bag.offers import Listing, Offer
+    from smp_motor_ident.bag.mapping import MotorMap, Signal, SignalMap, load_mapping, parse_mapping
     from smp_motor_ident.bag.propose import list_topics
     from smp_motor_ident.bag.read import join_records, read_experiments, read_records
+    from smp_motor_ident.bag.topics import Listing, TopicInfo
     from smp_motor_ident.bag.writer import BagWriter
 
 __all__ = [
     "BagWriter",
     "Listing",
     "MotorMap",
-    "Offer",
     "Signal",
     "SignalMap",
+    "TopicInfo",
     "join_records",
     "list_topics",
-    "load",
-    "parse",
+    "load_mapping",
+    "parse_mapping",
     "read_experiments",
     "read_records",
 ]
 
 _HOMES = {
-    **dict.fromkeys(("MotorMap", "Signal", "SignalMap", "load", "parse"), "mapping"),
-    **dict.fromkeys(("Listing", "Offer"), "offers"),
+    **dict.fromkeys(
+        ("MotorMap", "Signal", "SignalMap", "load_mapping", "parse_mapping"), "mapping"
+    ),
+    **dict.fromkeys(("Listing", "TopicInfo"), "topics"),
     **dict.fromkeys(("join_records", "read_experiments", "read_records"), "read"),
     **{"list_topics": "propose", "BagWriter": "writer"},
 }

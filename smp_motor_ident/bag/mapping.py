@@ -96,7 +96,7 @@ class SignalMap:
     msg_files: tuple[str, ...] = ()
 
 
-def parse(items: Iterable[str], msg_files: Iterable[str] = ()) -> SignalMap:
+def parse_mapping(items: Iterable[str], msg_files: Iterable[str] = ()) -> SignalMap:
     """Read a mapping as it is written on the command line: ``[WHEEL.]KEY=VALUE``.
 
     KEY is a signal, a property of the hardware or an option; an item may hold several, separated by
@@ -121,7 +121,7 @@ def parse(items: Iterable[str], msg_files: Iterable[str] = ()) -> SignalMap:
     return from_document(document, "mapping")
 
 
-def load(path: str | os.PathLike[str]) -> SignalMap:
+def load_mapping(path: str | os.PathLike[str]) -> SignalMap:
     """Read a mapping from a YAML file; paths of its ``types`` are relative to it."""
     path = Path(path)
     try:
@@ -158,7 +158,7 @@ def from_document(document: Any, where: str = "mapping") -> SignalMap:
     return SignalMap(each, defaults, tuple(types))
 
 
-def of(mapping: Any) -> SignalMap:
+def read_mapping(mapping: Any) -> SignalMap:
     """Return any form of a mapping as `SignalMap`."""
     if mapping is None:
         return SignalMap()
@@ -167,10 +167,10 @@ def of(mapping: Any) -> SignalMap:
     if isinstance(mapping, Mapping):
         return from_document(mapping)
     if isinstance(mapping, str) and "=" in mapping:
-        return parse([mapping])
+        return parse_mapping([mapping])
     if isinstance(mapping, (str, os.PathLike)):
-        return load(mapping)
-    return parse(mapping)
+        return load_mapping(mapping)
+    return parse_mapping(mapping)
 
 
 def _motor(entry: Any, where: str, defaults: MotorMap | None = None) -> MotorMap:

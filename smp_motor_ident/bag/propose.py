@@ -17,7 +17,6 @@ from smp_motor_control.arrays import Array
 from smp_motor_control.errors import is_ros_name
 from smp_motor_ident.bag import axis, checks, decode, drives, mapping, names, read, storage
 from smp_motor_ident.bag.clock import split_into_runs
-from smp_motor_ident.bag.offers import Listing, Offer, Proposal, offers_of
 from smp_motor_ident.bag.source import Recording, find_recordings
 from smp_motor_ident.bag.tables import (
     MIN_TIMES_SINCE_1970,
@@ -25,6 +24,7 @@ from smp_motor_ident.bag.tables import (
     is_time_of_part,
     plan_from_names,
 )
+from smp_motor_ident.bag.topics import Listing, Proposal, TopicInfo, describe_topics
 from smp_motor_ident.bag.types import Types
 from smp_motor_ident.bag.units import needs, unit_of
 from smp_motor_ident.errors import BagError
@@ -42,7 +42,7 @@ class _Candidate:
     role: str
     wheel: str
     robot: str
-    offer: Offer
+    info: TopicInfo
     path: str
     time: Array
     value: Array
@@ -50,11 +50,13 @@ class _Candidate:
     @property
     def source(self) -> str:
         """Source as a mapping writes it, in quotes where it would be misread."""
-        whole = self.offer.topic or self.path
-        if self.offer.topic.startswith("/") and self.path != "value":
-            whole = f"{self.offer.topic}.{self.path}"
-            signal = mapping.parse([f"direction={whole}"]).motors["motor"].signals["direction"]
-            if signal == mapping.Signal(self.offer.topic, self.path):
+        whole = self.info.topic or self.path
+        if self.info.topic.startswith("/") and self.path != "value":
+            whole = f"{self.info.topic}.{self.path}"
+            signal = (
+                mapping.parse_mapping([f"direction={whole}"]).motors["motor"].signals["direction"]
+            )
+            if signal == mapping.Signal(self.info.topic, self.path):
                 return whole
         elif re.fullmatch(r"[\w()\[\]]+", whole):
             return whole
@@ -63,8 +65,8 @@ class _Candidate:
     @property
     def unit(self) -> str:
         """Unit that follows the source, by name; never a scale."""
-        text = f"{self.offer.topic}.{self.path}"
-        if unit := unit_of(self.role, self.offer.units.get(self.path, ""), text):
+        text = f"{self.info.topic}.{self.path}"
+        if unit := unit_of(self.role, self.info.units.get(self.path, ""), text):
             return f":{unit}"
         likely = names.HINTS.get(self.role, ())
         hint = next((unit for pattern, unit in likely if re.search(pattern, text, re.I)), "")
@@ -86,9 +88,9 @@ def list_topics(paths: Any, msg_files: Iterable[str] = ()) -> list[Listing]:
     listings = []
     for recording in find_recordings(paths):
         with read.one_line(recording):
-            offers = offers_of(recording, types)
-            needed = all(offer.type != read.STATE for offer in offers)
-            proposal = propose(recording, offers, types) if needed else Proposal()
+            topics = describe_topics(recording, types)
+            needed = all(info.type != read.STATE for info in topics)
+            proposal = propose(recording, topics, types) if needed else Proposal()
             if proposal.suggestion:
                 try:
                     read.read_recording(recording, _fill_placeholders(proposal), types)
@@ -97,27 +99,27 @@ def list_topics(paths: Any, msg_files: Iterable[str] = ()) -> list[Listing]:
                     recording.findings.append(storage.found("proposal_failed", text))
                     proposal = Proposal(remark="no mapping is suggested that can be read")
         listings.append(Listing(
-            name=recording.name, offers=offers, needs_mapping=needed,
+            name=recording.name, topics=topics, needs_mapping=needed,
             findings=recording.findings, **vars(proposal),
         ))  # fmt: skip
     return listings
 
 
-def propose(recording: Recording, offers: list[Offer], types: Types) -> Proposal:
+def propose(recording: Recording, topics: list[TopicInfo], types: Types) -> Proposal:
     """Return the file's own mapping, or one by names that the data confirm where they can."""
     if own := _from_file(recording):
         return own
-    apart = [[offer] for offer in offers] if any(o.table and o.count for o in offers) else [offers]
+    apart = [[info] for info in topics] if any(o.table and o.count for o in topics) else [topics]
     proposals = [_by_names_and_data(recording, group, types) for group in apart]
     return next((p for p in proposals if p.suggestion), proposals[0])
 
 
-def _by_names_and_data(recording: Recording, offers: list[Offer], types: Types) -> Proposal:
+def _by_names_and_data(recording: Recording, topics: list[TopicInfo], types: Types) -> Proposal:
     """Return a mapping by names and data for each group of fields."""
-    time = _time(offers)
-    fields = list(_candidates(recording, offers, types, time))
+    time = _time(topics)
+    fields = list(_candidates(recording, topics, types, time))
     every = [c for c in fields if c.value.size]
-    alone = recording.is_table and len(offers) == 1
+    alone = recording.is_table and len(topics) == 1
     unnamed = [c for c in every if not c.role]
     if alone and time is None and (k := drives.find_clock([c.value for c in unnamed])) is not None:
         time = replace(unnamed[k], role="time")
@@ -186,7 +188,7 @@ def _by_robot(every: Sequence[_Candidate]) -> list[_Candidate]:
 
 def _namespace(candidate: _Candidate) -> tuple[str, str]:
     """Return a topic's first name and its others; no first where it has one only."""
-    parts = candidate.offer.topic.split("/", 2)
+    parts = candidate.info.topic.split("/", 2)
     return (parts[1], parts[2]) if len(parts) == 3 and not parts[0] else ("", parts[-1])
 
 
@@ -322,45 +324,47 @@ def _explain_failure(fields: list[_Candidate]) -> str:
 def _fill_placeholders(proposal: Proposal) -> mapping.SignalMap:
     """Return the mapping of a proposal, with placeholders for the values the user must add."""
     unit = ":ms" if any(text.startswith("time=") for text in proposal.asked) else ""
-    given = mapping.parse([i + unit if i.startswith("time=") else i for i in proposal.suggestion])
+    given = mapping.parse_mapping(
+        [i + unit if i.startswith("time=") else i for i in proposal.suggestion]
+    )
     hardware = {"supply_voltage": 12.0, "counts_per_revolution": 1.0}
     some: Any = dict(pwm_full_scale=1e9, wheel_radius=1.0, sample_time=1.0, pole_pairs=1.0)
     motors = {w: replace(one, hardware=hardware, **some) for w, one in given.motors.items()}
     return replace(given, motors=motors)
 
 
-def _time(offers: list[Offer]) -> _Candidate | None:
+def _time(topics: list[TopicInfo]) -> _Candidate | None:
     """Return the column of time of a table."""
-    for offer in offers:
-        for path in offer.fields if offer.table else []:
+    for info in topics:
+        for path in info.fields if info.table else []:
             if path != "value" and re.search(TIME_NAMES, path, re.IGNORECASE):
                 empty = np.zeros(0)
-                return _Candidate("time", "", "", offer, path, empty, empty)
+                return _Candidate("time", "", "", info, path, empty, empty)
     return None
 
 
 def _candidates(
-    recording: Recording, offers: list[Offer], types: Types, time: _Candidate | None
+    recording: Recording, topics: list[TopicInfo], types: Types, time: _Candidate | None
 ) -> Iterator[_Candidate]:
     """Yield the fields with a role by name, and the others of a table."""
-    named: list[tuple[str, Offer, str]] = []
-    for offer in offers:
-        place = names.find_pose_fields(offer.fields)
-        for path in offer.fields:
+    named: list[tuple[str, TopicInfo, str]] = []
+    for info in topics:
+        place = names.find_pose_fields(info.fields)
+        for path in info.fields:
             if (time and path == time.path) or is_time_of_part(path) or path in place:
                 continue
-            role = names.role_of(offer.topic, path)
-            barred = names.is_barred(role, f"{offer.type} {offer.topic} {path}")
-            if (role or offer.table) and not barred:
-                named.append((role, offer, path))
+            role = names.role_of(info.topic, path)
+            barred = names.is_barred(role, f"{info.type} {info.topic} {path}")
+            if (role or info.table) and not barred:
+                named.append((role, info, path))
     wanted: dict[str, list[str]] = {}
-    for _, offer, path in named:
-        wanted.setdefault(offer.topic, []).append(path)
-    if time is not None and time.offer.topic in wanted:
-        wanted[time.offer.topic].append(time.path)
+    for _, info, path in named:
+        wanted.setdefault(info.topic, []).append(path)
+    if time is not None and time.info.topic in wanted:
+        wanted[time.info.topic].append(time.path)
     tables = decode.collect(recording, wanted, types)
-    for role, offer, path in named:
-        table = tables[offer.topic]
+    for role, info, path in named:
+        table = tables[info.topic]
         if path not in table.columns:
             continue
         value = table.columns[path].astype(np.float64)
@@ -372,12 +376,12 @@ def _candidates(
         at = np.arange(value.size) if clock is None else clock
         there = table.present.get(path)
         kept = np.isfinite(value) & (True if there is None else there)
-        wheel = names.wheel_of(f"{offer.topic}.{path}")
+        wheel = names.wheel_of(f"{info.topic}.{path}")
         value, times = value[kept], at.astype(np.float64)[kept]
         whole = np.array_equal(value, np.rint(value))
         role = "position" if role == "count" and not whole else role
         if not (role == "voltage" and _is_supply(path, value)):
-            yield _Candidate(role, wheel, "", offer, path, times, value)
+            yield _Candidate(role, wheel, "", info, path, times, value)
 
 
 def _find_wrap(angle: Array) -> float:

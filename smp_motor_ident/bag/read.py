@@ -41,7 +41,7 @@ def read_experiments(paths: Any, mapping: Any = None) -> dict[str, list[Record]]
 
     Unreadable recordings in a folder become findings of the others.
     """
-    asked = mappings.of(mapping)
+    asked = mappings.read_mapping(mapping)
     types = Types(asked.msg_files)
     read: dict[str, list[Record]] = {}
     failures: list[BagError] = []

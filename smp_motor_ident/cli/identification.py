@@ -137,11 +137,11 @@ def signal_map(arguments: argparse.Namespace) -> bag.SignalMap | None:
     if arguments.map and arguments.mapping:
         raise ParameterError("--map and --mapping exclude each other; write all into the file")
     if arguments.mapping:
-        loaded = bag.load(arguments.mapping)
+        loaded = bag.load_mapping(arguments.mapping)
         return replace(loaded, msg_files=(*loaded.msg_files, *arguments.msg))
     if not (arguments.map or arguments.msg):
         return None
-    return bag.parse(arguments.map, arguments.msg)
+    return bag.parse_mapping(arguments.map, arguments.msg)
 
 
 def _read(
@@ -302,7 +302,9 @@ def setpoint_map(arguments: argparse.Namespace) -> bag.SignalMap:
         )
     if any(re.search(r"(^|\s|\.)voltage=", item) for item in items):
         raise ParameterError("--controller computes the voltage; leave out voltage=")
-    mapping = bag.parse([_SETPOINT.sub(r"\1voltage=", item) for item in items], arguments.msg)
+    mapping = bag.parse_mapping(
+        [_SETPOINT.sub(r"\1voltage=", item) for item in items], arguments.msg
+    )
     motors = {}
     for wheel, plan in mapping.motors.items():
         signals = dict(plan.signals)

@@ -91,8 +91,8 @@ def list_topics(paths: Sequence[str], msg_files: Sequence[str], program: str) ->
         listings = bag.list_topics(list(paths), msg_files)
     for listing in listings:
         out.print(listing.name, style="bold")
-        for offer in listing.offers:
-            _print_offer(out, offer)
+        for info in listing.topics:
+            _print_topic(out, info)
         for finding in listing.findings:
             out.print(f"{finding.severity}: {finding.message}", soft_wrap=True)
         if not listing.needs_mapping:
@@ -109,16 +109,16 @@ def list_topics(paths: Sequence[str], msg_files: Sequence[str], program: str) ->
     return 0
 
 
-def _print_offer(out: Console, offer: bag.Offer) -> None:
-    fields = ", ".join(offer.fields[:MAX_FIELDS])
-    if len(offer.fields) > MAX_FIELDS:
-        fields += f", ... ({len(offer.fields)} fields)"
+def _print_topic(out: Console, info: bag.TopicInfo) -> None:
+    fields = ", ".join(info.fields[:MAX_FIELDS])
+    if len(info.fields) > MAX_FIELDS:
+        fields += f", ... ({len(info.fields)} fields)"
     indent = ""
-    if offer.table and offer.count:
-        fields = f"of {offer.count} rows: {fields}"
-    if offer.topic:  # a CSV file has none
-        rate = f", {offer.rate:.4g} Hz" if offer.rate else ""
-        out.print(f"  {offer.topic}  {offer.type}  {offer.count} messages{rate}", soft_wrap=True)
+    if info.table and info.count:
+        fields = f"of {info.count} rows: {fields}"
+    if info.topic:  # a CSV file has none
+        rate = f", {info.rate:.4g} Hz" if info.rate else ""
+        out.print(f"  {info.topic}  {info.type}  {info.count} messages{rate}", soft_wrap=True)
         indent = "    "
-    if fields or offer.remark:
-        out.print(f"  {indent}{offer.remark or fields}", soft_wrap=True)
+    if fields or info.remark:
+        out.print(f"  {indent}{info.remark or fields}", soft_wrap=True)

@@ -97,9 +97,9 @@ class Settling:
         wheels = ", common to all wheels" if self.common else ""
         return (
             f"settles within {100 * self.tolerance:.0f} % in {1e3 * self.value:.3g} ms "
-            f"(at most {high}) after a change of set-point by {self.change:.3g} rad/s, its planned transition of "
-            f"{1e3 * self.transition:.3g} ms included{wheels}; an abrupt change, by the feedback "
-            f"alone, in {1e3 * self.abrupt:.3g} ms"
+            f"(at most {high}) after a change of set-point by {self.change:.3g} rad/s, its planned "
+            f"transition of {1e3 * self.transition:.3g} ms included{wheels}; an abrupt change, by "
+            f"feedback alone, in {1e3 * self.abrupt:.3g} ms"
         )
 
 

@@ -117,7 +117,7 @@ def test_a_comment_right_above_the_numbers_may_name_the_columns(tmp_path, above,
     path = tmp_path / "log.csv"
     path.write_text(above + "\n" + table(separator).partition("\n")[2])
     listing = list_topics(path)[0]
-    assert listing.offers[0].fields == names
+    assert listing.topics[0].fields == names
     unnamed = "no_column_names" in [finding.code for finding in listing.findings]
     assert unnamed is (names[0] == "c1")
     record = read_records(path, [f"voltage={names[1]}:V velocity={names[2]}:deg/s sample_time=1"])
@@ -133,7 +133,7 @@ def test_a_comment_right_above_the_numbers_may_name_the_columns(tmp_path, above,
 )
 def test_names_of_several_words_are_not_shifted(tmp_path, head, names):
     (tmp_path / "log.txt").write_text(head + "\n" + table(" ").partition("\n")[2])
-    assert list_topics(tmp_path / "log.txt")[0].offers[0].fields == names
+    assert list_topics(tmp_path / "log.txt")[0].topics[0].fields == names
 
 
 def test_a_voltage_may_have_been_held_up_to_its_row(tmp_path):
@@ -207,8 +207,8 @@ def test_columns_of_words_are_not_in_the_way(tmp_path):
     ]
     path = tmp_path / "log.csv"
     path.write_text("\n".join(["t;frame;u;y;remark", *rows]))
-    (offer,) = list_topics(path)[0].offers
-    assert offer.fields == ["t", "u", "y"]
+    (info,) = list_topics(path)[0].topics
+    assert info.fields == ["t", "u", "y"]
     assert len(read_records(path, ["voltage=u velocity=y time=t"])["motor"]) == len(rows)
     with pytest.raises(BagError, match="line 2, column 'frame': \"'map'\" is not a number"):
         read_records(path, ["voltage=frame velocity=y time=t"])
@@ -216,7 +216,7 @@ def test_columns_of_words_are_not_in_the_way(tmp_path):
 
 def test_quoted_cells_with_decimal_commas_are_no_quoted_rows(tmp_path):
     (tmp_path / "u.csv").write_text('"u"\n' + "".join(f'"{x:g}"\n'.replace(".", ",") for x in U))
-    assert list_topics(tmp_path / "u.csv")[0].offers[0].fields == ["u"]
+    assert list_topics(tmp_path / "u.csv")[0].topics[0].fields == ["u"]
 
 
 def test_a_time_with_an_offset_brings_two_tables_onto_one_clock(tmp_path):
@@ -307,9 +307,9 @@ def test_the_recordings_of_real_motors_are_read():
 def test_labels_of_several_words_have_their_units(tmp_path):
     rows = [f"PWM percent: {u}%, Motor speed: {y} rpm" for u, y in zip(U, Y)]
     (tmp_path / "log.txt").write_text("\n".join(["connected", *rows]))
-    offer = list_topics(tmp_path / "log.txt")[0].offers[0]
-    assert offer.fields == ["PWM percent [%]", "Motor speed [rpm]"]
-    assert offer.units == {"PWM percent [%]": "%", "Motor speed [rpm]": "rpm"}
+    info = list_topics(tmp_path / "log.txt")[0].topics[0]
+    assert info.fields == ["PWM percent [%]", "Motor speed [rpm]"]
+    assert info.units == {"PWM percent [%]": "%", "Motor speed [rpm]": "rpm"}
 
 
 def columns(folder: Path, *names: str) -> list[Path]:

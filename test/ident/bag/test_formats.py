@@ -170,9 +170,9 @@ def test_a_message_that_changed_between_distributions_is_read_by_the_fitting_def
         for k in range(10)
     ]
     path = write_sqlite(tmp_path / "foxy.db3", sent, schema=2)
-    offers = list_topics(path)[0].offers
-    assert "range" in offers[0].fields
-    assert "variance" not in offers[0].fields
+    topics = list_topics(path)[0].topics
+    assert "range" in topics[0].fields
+    assert "variance" not in topics[0].fields
     record = read_records(path, ["voltage=/range.range", "velocity=/range.max_range"])["motor"]
     assert set(record.voltage) == {0.5}
 

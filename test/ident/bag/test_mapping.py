@@ -4,8 +4,8 @@
 import numpy as np
 import pytest
 
-from smp_motor_ident.bag import Signal, load, parse, read_records
-from smp_motor_ident.bag.mapping import of
+from smp_motor_ident.bag import Signal, load_mapping, parse_mapping, read_records
+from smp_motor_ident.bag.mapping import read_mapping
 from smp_motor_ident.errors import BagError
 
 
@@ -33,7 +33,7 @@ from smp_motor_ident.errors import BagError
 )  # fmt: skip
 def test_a_signal_is_read_from_its_text(text, signal):
     name = text.partition("=")[0]
-    mapping = parse([text])
+    mapping = parse_mapping([text])
     signals = mapping.motors["motor"].signals if mapping.motors else mapping.defaults.signals
     found = signals[name]
     assert found.scale == pytest.approx(signal.scale, rel=1e-15)
@@ -54,18 +54,18 @@ def test_the_same_is_written_in_yaml_and_on_the_command_line(tmp_path):
         "    velocity: /joint_states.velocity[left]:rpm\n"
         "    gear_ratio: 65.5\n"
     )
-    loaded = load(file)
+    loaded = load_mapping(file)
     items = [
         "supply_voltage=12 held=before",
         "left.voltage=/pwm.data*12/255",
         "left.velocity=/joint_states.velocity[left]:rpm",
         "left.gear_ratio=65.5",
     ]
-    parsed = parse(items, [str(tmp_path / "msgs")])
+    parsed = parse_mapping(items, [str(tmp_path / "msgs")])
     assert loaded == parsed
-    assert of(str(file)) == of(file) == loaded
-    assert of(parsed) is parsed
-    assert of(items).motors == parsed.motors
+    assert read_mapping(str(file)) == read_mapping(file) == loaded
+    assert read_mapping(parsed) is parsed
+    assert read_mapping(items).motors == parsed.motors
 
 
 @pytest.mark.parametrize(
@@ -91,7 +91,7 @@ def test_the_same_is_written_in_yaml_and_on_the_command_line(tmp_path):
 )
 def test_invalid_values_are_named_with_the_valid_ones(item, reason):
     with pytest.raises(BagError) as refused:
-        parse([item])
+        parse_mapping([item])
     assert reason in str(refused.value)
     assert "\n" not in str(refused.value)
 
@@ -106,13 +106,13 @@ def test_a_file_that_is_not_a_mapping_is_refused_by_its_name(tmp_path, text):
     file = tmp_path / "map.yaml"
     file.write_text(text)
     with pytest.raises(BagError, match=r"map\.yaml") as refused:
-        load(file)
+        load_mapping(file)
     assert "\n" not in str(refused.value)
 
 
 def test_a_mapping_file_that_does_not_exist_is_named(tmp_path):
     with pytest.raises(BagError, match=r"nothing\.yaml"):
-        load(tmp_path / "nothing.yaml")
+        load_mapping(tmp_path / "nothing.yaml")
 
 
 def test_a_level_that_no_column_holds_is_written_in_the_mapping(tmp_path):
@@ -125,4 +125,4 @@ def test_a_level_that_no_column_holds_is_written_in_the_mapping(tmp_path):
 @pytest.mark.parametrize("name", ["a-b", "1", "a b", "ä", "a\n"])
 def test_a_wheel_needs_a_ros_name(name):
     with pytest.raises(BagError, match="is not a ROS name"):
-        of({"motors": {name: {"voltage": "u", "velocity": "y"}}})
+        read_mapping({"motors": {name: {"voltage": "u", "velocity": "y"}}})

@@ -296,7 +296,7 @@ def test_columns_of_one_length_are_listed_and_proposed_together(tmp_path):
     content = {"id": {"InputData": voltage, "OutputData": speed, "last": np.arange(6.0)}, "t": T}
     scipy.io.savemat(tmp_path / "lab.mat", content | {"limits": np.array([-12.0, 12.0])})
     listing = list_topics(tmp_path / "lab.mat")[0]
-    assert [(offer.count, offer.fields) for offer in listing.offers] == [
+    assert [(info.count, info.fields) for info in listing.topics] == [
         (N, ["id.InputData", "id.OutputData", "t"]),
         (6, ["id.last"]),
         (2, ["limits"]),
@@ -375,7 +375,7 @@ def test_a_column_without_a_number_is_named(tmp_path, column):
     columns = {"t": T, "voltage": motor(1)[0], "position": np.cumsum(motor(1)[1])}
     path = write(tmp_path / "log.csv", **{**columns, column: np.full(N, np.nan)})
     listing = list_topics(path)[0]
-    assert listing.offers[0].fields == ["t", "voltage", "position"]
+    assert listing.topics[0].fields == ["t", "voltage", "position"]
     assert f"{column} holds no number" in listing.remark
 
 

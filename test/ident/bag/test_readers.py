@@ -186,7 +186,7 @@ def test_entries_of_a_wpilib_data_log_are_signals_with_their_own_times(tmp_path)
     path.write_bytes(data_log(b"extra header"))
     mapping = ['voltage="/drive/left volts"', 'velocity="NT:left/speed[1]"']
     assert_motor(read_records(path, mapping)["motor"])
-    assert [offer.topic for offer in list_topics(path)[0].offers] == [
+    assert [info.topic for info in list_topics(path)[0].topics] == [
         "/drive/left volts",
         "NT:left/speed",
     ]

@@ -208,7 +208,7 @@ def test_types_defined_in_the_bag_are_used(tmp_path):
         writer.finish()
     record = read_records(path, REPORT_MAP)["motor"]
     np.testing.assert_array_equal(record.count, values[:, 1])
-    fields = list_topics(path)[0].offers[0].fields
+    fields = list_topics(path)[0].topics[0].fields
     assert {"wheels[0].speed", "wheels[1].ticks", "flags[2]", "raw[1]"} <= set(fields)
 
 
@@ -327,10 +327,10 @@ def test_the_topics_of_a_bag_are_listed(tmp_path):
     path = write_mcap(tmp_path / "bag.mcap", messages)
     listing = list_topics(path)[0]
     assert listing.needs_mapping
-    offers = {offer.topic: offer for offer in listing.offers}
-    assert offers["/joint_states"].fields == ["velocity[left_wheel]", "velocity[right_wheel]"]
-    assert offers["/temperature"].count == n
-    assert offers["/temperature"].rate == pytest.approx(100.0)
+    topics = {info.topic: info for info in listing.topics}
+    assert topics["/joint_states"].fields == ["velocity[left_wheel]", "velocity[right_wheel]"]
+    assert topics["/temperature"].count == n
+    assert topics["/temperature"].rate == pytest.approx(100.0)
     assert listing.suggestion == []  # no speed follows these voltages
 
 

@@ -17,7 +17,7 @@ _MAX_LISTED = 12  # elements of an array without names that are listed
 
 
 @dataclass
-class Offer:
+class TopicInfo:
     """One topic, or the columns of a table that have one length."""
 
     # topic, type: empty for the only table of a file
@@ -47,30 +47,30 @@ class Listing(Proposal):
     """Topics of a recording with a tested mapping; empty if it needs no mapping."""
 
     name: str  # of the recording
-    offers: list[Offer]  # by topic
+    topics: list[TopicInfo]  # by topic
     needs_mapping: bool  # false where the recording holds our own messages
     findings: list[Finding]  # missing or damaged parts
 
 
-def offers_of(recording: source.Recording, types: Types) -> list[Offer]:
+def describe_topics(recording: source.Recording, types: Types) -> list[TopicInfo]:
     """Return the topics of a recording with their fields, by its first messages."""
     if recording.is_table:
         return [
-            Offer(c.topic, c.type, count, fields=fields, table=True, units=c.units)
+            TopicInfo(c.topic, c.type, count, fields=fields, table=True, units=c.units)
             for c in recording.channels()
             for count, fields in _by_length(c)
         ]
-    found: dict[str, Offer] = {}
+    found: dict[str, TopicInfo] = {}
     spans: dict[str, tuple[int, int]] = {}
     for channel in recording.channels():
-        found.setdefault(channel.topic, Offer(channel.topic, channel.type))
+        found.setdefault(channel.topic, TopicInfo(channel.topic, channel.type))
     for batch in chain.from_iterable(recording.batches(lambda _: True)):
         topic = batch.channel.topic
-        offer = found.setdefault(topic, Offer(topic, batch.channel.type))
-        if not offer.count:
+        info = found.setdefault(topic, TopicInfo(topic, batch.channel.type))
+        if not info.count:
             plain, _ = unpack.decompress_messages(batch.take(np.arange(1)), recording.budget)
-            offer.fields, offer.remark = _fields(types, plain) if len(plain) else ([], "damaged")
-        offer.count += len(batch)
+            info.fields, info.remark = _fields(types, plain) if len(plain) else ([], "damaged")
+        info.count += len(batch)
         first, last = spans.get(topic, (2**63 - 1, -(2**63)))
         times = batch.log_time
         spans[topic] = (min(first, int(times.min())), max(last, int(times.max())))
