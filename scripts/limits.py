@@ -29,7 +29,7 @@ TABLES = {
 def page() -> str:
     """Return all limits as a page of Markdown."""
     lines = [
-        "# Limits",
+        "# Decision thresholds",
         "",
         "Every threshold of a decision; printed by `python scripts/limits.py`.",
     ]

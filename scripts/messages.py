@@ -12,7 +12,7 @@ STATES = {"State", "Fault"}
 """Enumerations whose values are messages."""
 TELLS = re.compile("_?(describe|report|problem|wrong|assess|name_cause)")
 """Functions that return a message."""
-HEAD = """# Messages
+HEAD = """# Error and diagnostic messages
 
 Messages of tools and nodes by package, printed by `python scripts/messages.py`. `N` stands for a
 number, `…` for a word. The advice of a finding has a line of its own.

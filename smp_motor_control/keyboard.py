@@ -52,9 +52,9 @@ def parse_keys(text: str) -> list[str]:
 class Speeds:
     """Speeds of a held key."""
 
-    linear: float = described(0.2, "Of the body [m/s].", name="linear_speed")
-    angular: float = described(0.6, "Of the body [rad/s].", name="angular_speed")
-    wheel: float = described(1.5, "Of a wheel [rad/s].", name="wheel_speed")
+    linear: float = described(0.2, "Speed of the body [m/s].", name="linear_speed")
+    angular: float = described(0.6, "Yaw rate of the body [rad/s].", name="angular_speed")
+    wheel: float = described(1.5, "Speed of a wheel [rad/s].", name="wheel_speed")
     step: float = described(0.1, "Relative step of the speeds at + and -.", name="speed_step")
     timeout: float = described(
         0.6, "Time without a repeat after which a key counts as released [s].", maximum=5.0,

@@ -147,7 +147,10 @@ def _undo_delay(
     motor.tell("voltage_late", text, "warning", rows=rows, late=late)
     keep = np.concatenate([np.arange(a, b) < b - rows for a, b in pairwise(edges)])
     if not keep.any():
-        raise BagError(f"{motor.where}: no segment is longer than the {rows} rows of that")
+        raise BagError(
+            f"{motor.where}: the voltage is recorded {rows} rows late, and no segment is longer; "
+            "record longer ones"
+        )
     voltage = np.roll(columns["voltage"], -rows)
     kept = {n: None if v is None else v[keep] for n, v in {**columns, "voltage": voltage}.items()}
     begun = np.cumsum(starts)[keep]
@@ -279,7 +282,7 @@ def _find_gaps(
     if cut.sum() > sum(float(e.get("times") or 0.0) for e in apart):
         text = f"{int(cut.sum())} gaps of up to {steps[cut].max() * 1e-9:.3g} s"
         text += f" ({int(missing[cut].sum())} samples missing)" if beat.regular else ""
-        motor.tell("gaps", f"{text}; a new segment behind each", gaps=int(cut.sum()))
+        motor.tell("gaps", f"{text}; a new segment begins after each", gaps=int(cut.sum()))
     if not beat.regular:
         text = (
             f"the sampling is irregular: median {beat.interval * 1e-6:.4g} ms, "

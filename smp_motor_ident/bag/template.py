@@ -91,7 +91,7 @@ class _Parser:
         root = self.message(name)
         rest = len(self.data) - self.position
         if not 0 <= rest <= (0 if self.ros1 else 3):  # writers may pad to a multiple of four
-            raise DecodeError(f"{rest} bytes are left behind its last field")
+            raise DecodeError(f"{rest} bytes follow its last field")
         return Template(root, self.lengths, self.order)
 
     def message(self, name: str) -> dict[str, Any]:

@@ -262,7 +262,7 @@ def drive_undisturbed(
                 raise
             say(f"the drive was disturbed: {error}")
             continue
-        late = verification.report_silence(silence) or verification.report_slow_answers(changes)
+        late = verification.report_silence(silence) or verification.report_loop_delay(changes)
         judged = verification.judge(changes)
         if not (late and (judged or late[0].severity == "refused")):
             break

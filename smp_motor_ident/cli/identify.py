@@ -46,7 +46,7 @@ def parser() -> Parser:
     add("--output", "-o", metavar="DIR", help="folder for the results")
     add("--force", action="store_true", help="replace existing results")
     add("--validate", action="append", default=[], metavar="BAG",
-        help="recording that judges the fit and is not fitted; may be repeated")  # fmt: skip
+        help="recording for validation only; may be repeated")  # fmt: skip
     add("--wheel", action="append", default=[], metavar="NAME",
         help="identify only this wheel; may be repeated")  # fmt: skip
     add("--model", default="auto",

@@ -18,22 +18,24 @@ SPEED_SOURCES = ("measured", "difference", "observer")
 
 AIMS: dict[str, dict[str, Any]] = {
     "phase_margin": dict(
-        type=float, metavar="DEG", help="required phase margin; default of margin: 60"
+        type=float, metavar="DEG", help="required phase margin; default of the method margin: 60"
     ),
     "maximum_sensitivity": dict(
-        type=float, metavar="MS", help="largest Ms; default of margin: 1.4"
+        type=float,
+        metavar="MS",
+        help="largest sensitivity peak Ms; default of the method margin: 1.4",
     ),
     "focus": dict(
         choices=("balanced", "tracking", "load"),
         help="what the method margin favours: set-points, loads or both (default)",
     ),
     "bandwidth": dict(type=float, metavar="RAD/S", help="crossover frequency of the method margin"),
-    "structure": dict(choices=("pi", "pid"), help="default: the better one"),
+    "structure": dict(choices=("pi", "pid"), help="of the controller; default: the better one"),
     "closed_loop_time_constant": dict(type=float, metavar="S", help="of the method simc"),
     "natural_frequency": dict(
         type=float, metavar="RAD/S", help="of the method pole_placement; default: the highest"
     ),
-    "damping": dict(type=float, help="of the method pole_placement; default 0.8"),
+    "damping": dict(type=float, metavar="RATIO", help="of the method pole_placement; default 0.8"),
     "max_velocity": dict(type=float, metavar="RAD/S", help="limit of the set-point at the wheel"),
     "max_acceleration": dict(
         type=float, metavar="RAD/S2", help="limit of the reference at the wheel"
@@ -46,7 +48,7 @@ AIMS: dict[str, dict[str, Any]] = {
 """Arguments for the targets of the design."""
 
 LOOP: dict[str, dict[str, Any]] = {
-    "rate": dict(type=float, metavar="HZ", help="steps per second"),
+    "rate": dict(type=float, metavar="HZ", help="sampling rate of the loop"),
     "delay": dict(
         type=float, metavar="S",
         help="longest delay from measurement to voltage, without the hold; default: one sample",
@@ -68,7 +70,7 @@ LOOP: dict[str, dict[str, Any]] = {
     "angle_noise": dict(type=float, metavar="RAD",
                         help="standard deviation of an angle that is differenced, at the motor "
                         "shaft"),
-    "gear_ratio": dict(type=float, help="motor revolutions per wheel revolution"),
+    "gear_ratio": dict(type=float, metavar="RATIO", help="motor revolutions per wheel revolution"),
     "counts_per_revolution": dict(type=float, metavar="COUNTS", help="counts per motor revolution"),
     "supply": dict(type=float, metavar="V", help="supply voltage"),
 }  # fmt: skip
@@ -83,9 +85,11 @@ RUNNING: dict[str, dict[str, Any]] = {
     ),
     "watch": dict(type=float, default=3.0, metavar="S", help="length of the trial; default 3"),
     "relay": dict(metavar="WHEEL", help="tune this wheel by relay feedback, without a model"),
-    "relay_amplitude": dict(type=float, metavar="V", help="default: a quarter of the supply"),
+    "relay_amplitude": dict(
+        type=float, metavar="V", help="of the output; default: a quarter of the supply"
+    ),
     "relay_hysteresis": dict(
-        type=float, default=0.05, metavar="RAD/S", help="at the wheel; default 0.05"
+        type=float, default=0.05, metavar="RAD/S", help="of the speed at the wheel; default 0.05"
     ),
     "relay_seconds": dict(
         type=float, default=4.0, metavar="S", help="length of the test; default 4"

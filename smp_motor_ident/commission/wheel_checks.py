@@ -77,7 +77,7 @@ def position(robot: Robot) -> Iterator[Finding]:
     """Check that odometry can use the positions."""
     for wheel, problem in robot.positions.items():
         if problem:
-            yield Finding("position", "warning", f"{wheel}: {problem}", {"wheel": wheel})
+            yield Finding("position_unusable", "warning", f"{wheel}: {problem}", {"wheel": wheel})
 
 
 def motion(robot: Robot) -> Iterator[Finding]:
@@ -85,7 +85,7 @@ def motion(robot: Robot) -> Iterator[Finding]:
     for wheel, one in robot.figures.items():
         if one.at_rest > BREAKAWAY_COUNTS.value:
             yield Finding(
-                "turns_at_rest", "refused",
+                "motion_at_zero_voltage", "refused",
                 f"{wheel}: turned by {one.at_rest:.0f} counts under zero voltage",
                 {"wheel": wheel, "counts": one.at_rest, "limit": BREAKAWAY_COUNTS.value},
                 "see that nothing else drives or turns the wheel, and that the encoder counts "
@@ -180,7 +180,7 @@ def gear_ratio(robot: Robot) -> Iterator[Finding]:
         if abs(known / described.gear_ratio - 1.0) > VELOCITY_TOLERANCE.value:
             yield Finding(
                 "gear_ratio", "refused",
-                f"{wheel}: describes itself with {said}, the motor file has {known:g}",
+                f"{wheel}: motor_description has {said}, the motor file {known:g}",
                 {"wheel": wheel, "described": described.gear_ratio, "known": known},
                 "correct the one that is wrong",
             )  # fmt: skip

@@ -286,7 +286,7 @@ def _finding(name: str, share: float, out: Mapping[str, float]) -> Finding:
     if name == "friction" and share > 0:
         return Finding(
             "friction_high", "warning",
-            f"friction is {change}, both ways: bearings, gearbox, or something that drags",
+            f"friction is {change}, in both directions: bearings, gearbox, or a part that rubs",
             evidence, "turn the wheel by hand with the power off",
         )  # fmt: skip
     return Finding(

@@ -107,7 +107,7 @@ def outliers(rows: Sequence[Row]) -> list[Mark]:
                 shown = words.state(row.values[name])
                 text = (
                     f"is {shown}, {100 * (one / middle - 1):+.2g} % from the median of "
-                    f"{len(last)} robots, {abs(one - middle) / wide:.1f} of their scatters"
+                    f"{len(last)} robots, {abs(one - middle) / wide:.1f} times their scatter"
                 )
                 marks.append(Mark("outlier", row.robot, wheel, name, text))
     return marks

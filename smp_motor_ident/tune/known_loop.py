@@ -86,8 +86,8 @@ def reconstruct(record: Record, loop: KnownLoop, numbers: Mapping[str, float]) -
     note = Finding(
         "reconstructed_voltage",
         "note",
-        f"voltage: reconstructed by the known loop ({len(record)} samples); it depends on its "
-        f"gains and the supply of {supply:g} V",
+        f"voltage: reconstructed from the known controller ({len(record)} samples); it depends on "
+        f"its gains and the supply of {supply:g} V",
         {"error": error},
     )
     return replace(record, voltage=volts, findings=(*record.findings, note), **counted)

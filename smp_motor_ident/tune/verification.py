@@ -280,7 +280,7 @@ def judge(changes: Sequence[Change]) -> list[Finding]:
     return found
 
 
-def report_slow_answers(changes: Sequence[Change]) -> list[Finding]:
+def report_loop_delay(changes: Sequence[Change]) -> list[Finding]:
     """Report overshoot caused by the drive's own timing, for which the bands allow."""
     worst = max(changes, key=lambda one: one.excess)
     if worst.excess <= 0.0:
@@ -289,7 +289,7 @@ def report_slow_answers(changes: Sequence[Change]) -> list[Finding]:
         f"{worst.wheel}: {worst.name}: the delays of samples and commands alone cause an overshoot "
         f"{worst.excess:.3g} % above the specification"
     )
-    return [Finding("slow_answers", "warning", text, {"excess": worst.excess}, _TIME)]
+    return [Finding("loop_delay", "warning", text, {"excess": worst.excess}, _TIME)]
 
 
 def report_silence(silence: float) -> list[Finding]:

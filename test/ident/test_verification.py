@@ -155,9 +155,9 @@ def test_a_drive_that_its_computer_slowed_is_within_its_bands_and_says_so(design
     slow = drive(designed, wait=0.03)
     assert slow.reading.overshoot > 10.0
     assert v.judge([slow]) == []
-    (found,) = v.report_slow_answers([slow, drive(designed)])
+    (found,) = v.report_loop_delay([slow, drive(designed)])
     assert found.severity == "warning" and found.evidence["excess"] == slow.excess
-    assert v.report_slow_answers([drive(designed)]) == []
+    assert v.report_loop_delay([drive(designed)]) == []
     # Where it is beyond even that, the computer is named, not the wheel.
     (refused,) = v.judge([replace(slow, bands=replace(slow.bands, overshoot=1.0))])
     assert refused.advice == found.advice != v.judge([drive(designed, offset=-0.05)])[0].advice

@@ -100,8 +100,8 @@ def test_feedback_that_comes_too_seldom_or_late_is_refused():
 
 
 def test_a_trembling_encoder_is_no_motion_and_a_turning_wheel_is():
-    assert "turns_at_rest" not in codes(replace(GOOD, at_rest=2.0))
-    assert codes(replace(GOOD, at_rest=40.0))["turns_at_rest"] == "refused"
+    assert "motion_at_zero_voltage" not in codes(replace(GOOD, at_rest=2.0))
+    assert codes(replace(GOOD, at_rest=40.0))["motion_at_zero_voltage"] == "refused"
     seen, phases = trace(driven=False)
     trembling = replace(seen, count=seen.count + np.arange(seen.count.size) % 2)
     still = figures(trembling, phases, HARDWARE)
@@ -236,5 +236,5 @@ def _rows(part: Trace) -> np.ndarray:
 def test_a_position_without_use_for_odometry_is_a_warning_of_its_wheel():
     found = judge(Robot({}, {}, positions={"left": "its position wraps", "right": ""}))
     assert [(f.code, f.severity, f.message) for f in found] == [
-        ("position", "warning", "left: its position wraps")
+        ("position_unusable", "warning", "left: its position wraps")
     ]

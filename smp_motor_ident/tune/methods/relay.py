@@ -85,7 +85,7 @@ def read_oscillation(
     if alike.size < MIN_CYCLES or power == 0:
         raise DesignError(
             f"only {alike.size} of {lengths.size} cycles are alike, it needs {MIN_CYCLES}: the "
-            "delay wanders; run it on a machine that is less busy"
+            "delay varies; run it on a machine that is less busy"
         )
     if not abs(cross) > 0:
         raise DesignError("the wheel did not move under the relay; use a larger amplitude")
