@@ -201,7 +201,7 @@ class Ramp(Excitation):
     period: float = 20.0  # nominal period [s]
 
     def _shape(self, time: Array) -> Array:
-        phase = (time / (self.period * DETUNING) + 0.75) % 1.0
+        phase = (time / (self.period * DETUNING) + 0.75) % 1.0  # begins at zero, rising
         triangle: Array = 4.0 * np.abs(phase - 0.5) - 1.0
         return triangle
 

@@ -56,13 +56,14 @@ class FreeResponse:
             self.product = 0.0
             self.slow, self.fast = -1.0 / time_constant, -math.inf
             return
-        half = -0.5 * time_constant / product
-        discriminant = half * half - 1.0 / product
+        # Roots of product s^2 + time_constant s + 1
+        mean = -0.5 * time_constant / product
+        discriminant = mean * mean - 1.0 / product
         if discriminant < 0.0:
             self.frequency = math.sqrt(-discriminant)
-            self.slow = self.fast = half
+            self.slow = self.fast = mean
             return
-        self.fast = half - math.sqrt(discriminant)
+        self.fast = mean - math.sqrt(discriminant)
         self.slow = 1.0 / (product * self.fast)
         self.gap = max(self.slow - self.fast, 0.0)
 

@@ -49,14 +49,14 @@ class ReferencePath:
 
         The latter is the value within ``delay`` ± ``doubt`` that is closest to the measurement.
         """
-        past, then = self._past, self._elapsed - delay
-        while len(past) > 2 and past[1][0] <= then - doubt:
+        past, time = self._past, self._elapsed - delay
+        while len(past) > 2 and past[1][0] <= time - doubt:
             past.popleft()
-        nominal = _interpolated(past, then)
+        nominal = _interpolate(past, time)
         if doubt == 0.0:
             return nominal, nominal
-        around = [nominal, *(_interpolated(past, then + x) for x in (-doubt, doubt))]
-        return nominal, min(max(measurement, min(around)), max(around))
+        possible = [nominal, *(_interpolate(past, time + x) for x in (-doubt, doubt))]
+        return nominal, min(max(measurement, min(possible)), max(possible))
 
     def acceleration_feedforward(
         self, compared: float, gains: PidGains, model: MotorModel | None
@@ -77,16 +77,16 @@ class ReferencePath:
         acceleration_feedforward += gains.feedforward_velocity / weight * (mean - compared)
         electrical = 0.0 if model is None else model.time_constant_product / model.time_constant
         acceleration_feedforward += electrical * gained / dt
-        least = gains.feedforward_static / weight
-        if not least:
+        friction = gains.feedforward_static / weight  # as an acceleration
+        if not friction:
             return acceleration_feedforward
-        acceleration_feedforward += least * self._friction(electrical)
+        acceleration_feedforward += friction * self._friction(electrical)
         # The controller adds friction by the sign of the compared reference or, at zero, of the
         # acceleration.
         if compared:
-            return acceleration_feedforward - math.copysign(least, compared)
+            return acceleration_feedforward - math.copysign(friction, compared)
         return math.copysign(
-            max(abs(acceleration_feedforward) - least, 0.0), acceleration_feedforward
+            max(abs(acceleration_feedforward) - friction, 0.0), acceleration_feedforward
         )
 
     def _friction(self, electrical: float) -> float:
@@ -120,13 +120,13 @@ def _sign(value: float) -> float:
     return math.copysign(1.0, value) if value else 0.0
 
 
-def _interpolated(past: deque[tuple[float, float]], then: float) -> float:
+def _interpolate(past: deque[tuple[float, float]], time: float) -> float:
     """Interpolate the history linearly, constant before its start."""
     t1, v1 = past[0]
     for t, v in past:
         t0, v0, t1, v1 = t1, v1, t, v
-        if t >= then:
+        if t >= time:
             break
     if t1 <= t0:
         return v1
-    return v0 + (v1 - v0) * min(max((then - t0) / (t1 - t0), 0.0), 1.0)
+    return v0 + (v1 - v0) * min(max((time - t0) / (t1 - t0), 0.0), 1.0)

@@ -194,7 +194,7 @@ def _export(arguments: argparse.Namespace) -> int:
 
 
 def _apply_file(arguments: argparse.Namespace) -> int:
-    """Set the gains of a file unchanged."""
+    """Set the gains of a parameter file in the running wheels, unchanged."""
     if arguments.source is not None or arguments.output is not None or not arguments.apply:
         raise ParameterError("--gains needs --apply; leave out source and --output")
     return applying.apply(applying.from_file(arguments.gains), arguments)

@@ -44,30 +44,34 @@ def compare(estimates: Mapping[str, Estimate]) -> list[Compared]:
     """Return the quantities known for at least one wheel, side by side."""
     made = []
     for name in COMPARED:
-        held = {
+        quantities = {
             wheel: words.scaled(quantity)
             for wheel, one in estimates.items()
             if (quantity := {**one.parameters, **one.combinations}.get(name)) is not None
         }
-        if any(quantity.value is not None for quantity in held.values()):
-            made.append(_on_axis(name, list(estimates), held))
+        if any(quantity.value is not None for quantity in quantities.values()):
+            made.append(_place_on_axis(name, list(estimates), quantities))
     return made
 
 
-def _on_axis(name: str, wheels: Sequence[str], held: Mapping[str, Quantity]) -> Compared:
-    known = [q for q in held.values() if q.value is not None]
+def _place_on_axis(
+    name: str, wheels: Sequence[str], quantities: Mapping[str, Quantity]
+) -> Compared:
+    """Return the intervals of all wheels on an axis that holds them with a margin."""
+    known = [q for q in quantities.values() if q.value is not None]
     ends = [x for q in known for x in (q.value, *(q.total_ci95 or ())) if x is not None]
     finite = list(filter(math.isfinite, ends))
     low, high = min(finite), max(finite)
-    wide = MARGIN * (high - low) or 1.0
-    low, high = low - wide, high + wide
+    margin = MARGIN * (high - low) or 1.0
+    low, high = low - margin, high + margin
 
     def place(value: float) -> float:
-        share = (min(max(value, low - wide), high + wide) - low) / (high - low)
+        """Return the place of a value in percent of the axis; infinite ends leave it."""
+        share = (min(max(value, low - margin), high + margin) - low) / (high - low)
         return round(100 * float(share), 2)
 
     def interval(wheel: str) -> Interval:
-        quantity = held.get(wheel, Quantity(None))
+        quantity = quantities.get(wheel, Quantity(None))
         value, random, total = quantity.value, quantity.ci95, quantity.total_ci95
         return Interval(
             wheel,

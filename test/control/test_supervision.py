@@ -105,16 +105,16 @@ def test_clock_that_jumps_ahead_or_after_a_gap_is_a_jump():
     assert c.jumps == 2 and c.offset == 0.0 and c.age == pytest.approx(0.41)
 
 
-def test_a_computer_whose_clock_is_set_learns_the_offset_of_the_hardwares():
+def test_offset_is_learnt_anew_when_the_computers_clock_is_set():
     c = clock()
     for k in range(3):
         assert c.accept(START + 5 * k * MS, START + 5 * k * MS, 7.0 + 0.005 * k)
-    # The time of day arrives from the network: five seconds on, between two samples.
+    # NTP sets the computer's clock forward by 5 s between two samples.
     verdicts = [
         c.accept(START + k * 5 * MS, START + (5000 + 5 * k) * MS, 7.0 + 0.005 * k) for k in (3, 4)
     ]
     assert verdicts == [Verdict.FIRST, Verdict.FRESH] and c.offset == pytest.approx(5.0)
-    # Five seconds of silence that the steady clock saw too, and stamps that know nothing of it.
+    # After 5 s of silence on the steady clock, a stamp without that gap is late.
     assert c.accept(START + 25 * MS, START + 10_025 * MS, 12.0) is Verdict.LATE
 
 

@@ -20,7 +20,8 @@ TRUTH = {
 }
 
 
-def right(record: Record, truth: dict[str, float]) -> None:
+def assert_covered(record: Record, truth: dict[str, float]) -> None:
+    """Assert that the true values are within the stated uncertainty of an estimate."""
     found = estimate(record).combinations
     for name, true in truth.items():
         q = found[name]
@@ -55,7 +56,7 @@ def test_a_command_logged_early_does_not_slow_the_motor(kind):
     out = simulate(t, ran, R, L, K, J, B, TC, np.zeros(t.size), 100)
     count = np.floor(out[:, 2] * 500 / (2 * np.pi)).astype(np.int64)
     record = Record("motor", t, v, count=count, hardware=Hardware(1.0, 500.0))
-    right(record, TRUTH)
+    assert_covered(record, TRUTH)
     delay = estimate(record).combinations["delay"]
     assert abs(delay.value - 1 / 200) < 4 * delay.std < 2e-3
 
@@ -81,7 +82,7 @@ def test_a_linearly_interpolated_command_does_not_increase_the_inductance(seed):
     _, speed, _ = lsim(motor, v, t)  # a first-order hold, as by default
     speed = speed + 0.05 * rng.standard_normal(t.size)
     truth = {"dc_gain": motor[0][0], "time_constant": slow[0], "time_constant_product": slow[1]}
-    right(Record("motor", t, v, velocity=speed), truth)
+    assert_covered(Record("motor", t, v, velocity=speed), truth)
 
 
 def late_record(seed, tones, rate, samples, per_turn, late=None):
@@ -115,7 +116,7 @@ def test_a_fractional_delay_of_a_command_is_estimated(late):
     tones = (0.5, 1.1, 2.3, 5.3, 11.0, 19.0)
     record = late_record(1, tones, 200, 1000, 500.0, late)
     known = truth("rear_left", 0.3)
-    right(record, {name: known[name] for name in TRUTH})
+    assert_covered(record, {name: known[name] for name in TRUTH})
     assert estimate(record).value("delay") == pytest.approx(late / 10 / 200, abs=0.02 / 200)
 
 
@@ -133,7 +134,7 @@ def test_half_a_sample_of_delay_of_a_ramp_does_not_increase_the_lag(seed):
     below = k * k + r * b
     lags = {"time_constant": (r * j + el * b) / below, "time_constant_product": el * j / below}
     record = late_counts(rng, v, 200, 2000.0, 5, motor)
-    right(record, {"dc_gain": k / below, **lags, "static_voltage": r * tc / k})
+    assert_covered(record, {"dc_gain": k / below, **lags, "static_voltage": r * tc / k})
 
 
 def test_lags_bear_a_part_of_a_sample_that_slow_commands_do_not_show():

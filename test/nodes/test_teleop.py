@@ -145,7 +145,7 @@ def test_held_key_drives_and_its_release_stops_then_is_silent(ready, robot, even
     assert time.monotonic() - released >= 0.5  # key_timeout is 0.6 s from the last repeat
     assert robot.twists[-1].header.frame_id == "base_link"
     assert robot.twists[-1].header.stamp.sec > 0
-    # Zeros for 1 s after the last key; then nobody is disturbed.
+    # Zeros for 1 s after the last key, then silence
     robot.spin_for(1.5)
     count = len(robot.twists)
     robot.spin_for(0.3)

@@ -9,7 +9,7 @@ from smp_motor_control.nodes.wheel_test import WheelRecording
 
 
 def recording(position) -> WheelRecording:
-    """A wheel at 2 rad/s for 8 s, whose driver makes positions of its angle."""
+    """Return 8 s of a wheel at 2 rad/s whose driver reports ``position(angle)``."""
     rows = [(1e4 + t, 0.0, 3.0, 3.0, 2.0, position(2.0 * t), 0.0, 1.0)
             for t in (0.01 * k for k in range(800))]  # fmt: skip
     return WheelRecording(rows)

@@ -31,7 +31,7 @@ from smp_motor_ident.errors import BagError
 STEP = 10_000_000
 
 
-def even(topic: str, values: Any) -> list[Sent]:
+def every_10_ms(topic: str, values: Any) -> list[Sent]:
     return floats(topic, START + STEP * np.arange(len(values)), values)
 
 
@@ -54,7 +54,7 @@ def test_pwm_counts_and_the_joint_of_a_name(tmp_path, storage):
     pwm = rng.integers(-255, 256, n)
     speed = rng.normal(0, 1, (n, 2))
     messages = in_order(
-        even("/pwm", pwm),
+        every_10_ms("/pwm", pwm),
         joint_states(lambda _: ["right_wheel_joint", "left_wheel_joint"], speed),
     )
     write = write_mcap if storage == "mcap" else write_sqlite
@@ -80,7 +80,7 @@ def test_names_may_change_their_order_and_be_missing(tmp_path):
     ]
     frames = ["", "a", "long frame"]
     messages = in_order(
-        even("/pwm", pwm),
+        every_10_ms("/pwm", pwm),
         joint_states(lambda k: orders[k % 3], rows, lambda k: frames[k % 2]),
     )
     record = read_records(write_mcap(tmp_path / "bag.mcap", messages), MAP)["motor"]
@@ -91,7 +91,7 @@ def test_a_topic_whose_every_message_is_laid_out_otherwise_is_read(tmp_path):
     n = 150
     values = np.random.default_rng(2).normal(size=n)
     messages = in_order(
-        even("/pwm", values),
+        every_10_ms("/pwm", values),
         joint_states(
             lambda k: [
                 *(f"joint{j}" for j in range(k % 7)),
@@ -250,9 +250,9 @@ def test_a_duty_cycle_times_the_supply_as_it_was_measured(tmp_path):
     duty = np.linspace(-1, 1, n)
     supply = np.linspace(12.6, 11.4, n)
     messages = in_order(
-        even("/duty", duty),
-        even("/battery", supply),
-        even("/speed", np.zeros(n)),
+        every_10_ms("/duty", duty),
+        every_10_ms("/battery", supply),
+        every_10_ms("/speed", np.zeros(n)),
     )
     path = write_mcap(tmp_path / "bag.mcap", messages)
     mapping = ["voltage=/duty.data:duty supply=/battery.data velocity=/speed.data"]
@@ -265,7 +265,7 @@ def test_a_duty_cycle_times_the_supply_as_it_was_measured(tmp_path):
 
 
 def test_units_scales_and_shafts_come_out_in_si_at_the_motor(tmp_path):
-    messages = in_order(even("/u", [1.0] * 9), even("/w", [60.0] * 9))
+    messages = in_order(every_10_ms("/u", [1.0] * 9), every_10_ms("/w", [60.0] * 9))
     path = write_mcap(tmp_path / "bag.mcap", messages)
 
     def speed(spec: str) -> float:
@@ -298,7 +298,7 @@ def test_units_scales_and_shafts_come_out_in_si_at_the_motor(tmp_path):
     ],
 )
 def test_an_unfit_mapping_is_refused_with_the_available_fields(tmp_path, mapping, reason):
-    messages = in_order(even("/u", [1.0] * 9), even("/w", [60.0] * 9))
+    messages = in_order(every_10_ms("/u", [1.0] * 9), every_10_ms("/w", [60.0] * 9))
     path = write_mcap(tmp_path / "bag.mcap", messages)
     with pytest.raises(BagError) as refused:
         read_records(path, mapping)
@@ -319,9 +319,9 @@ def test_messages_that_are_not_of_their_type_are_left_out_and_told(tmp_path):
 def test_the_topics_of_a_bag_are_listed(tmp_path):
     n = 30
     messages = in_order(
-        even("/left/pwm", np.arange(n)),
-        even("/right/pwm", np.arange(n)),
-        even("/temperature", np.arange(n)),
+        every_10_ms("/left/pwm", np.arange(n)),
+        every_10_ms("/right/pwm", np.arange(n)),
+        every_10_ms("/temperature", np.arange(n)),
         joint_states(lambda _: ["left_wheel", "right_wheel"], [[1.0, 2.0]] * n),
     )
     path = write_mcap(tmp_path / "bag.mcap", messages)
