@@ -97,8 +97,7 @@ class Peer(DomainNode):
         client = self.node.create_client(SetParameters, "/skid_steer/set_parameters")
         assert client.wait_for_service(5.0)
         parameter = Parameter(
-            name=name,
-            value=ParameterValue(type=ParameterType.PARAMETER_DOUBLE, double_value=value),
+            name=name, value=ParameterValue(type=ParameterType.PARAMETER_DOUBLE, double_value=value)
         )
         future = client.call_async(SetParameters.Request(parameters=[parameter]))
         self.executor.spin_until_future_complete(future, 5.0)

@@ -28,10 +28,10 @@ SETTINGS = WheelSettings(
 
 @dataclass
 class Sample:
-    voltage: float
-    current: float
-    velocity: float
-    encoder_count: int
+    voltage: float = 0.0
+    current: float = math.nan
+    velocity: float = 0.0
+    encoder_count: int = 0
 
 
 class World:

@@ -35,6 +35,10 @@ def volts(t: float) -> float:
     return 6.0 + 2.0 * math.sin(8.3 * t) + 1.0 * math.sin(2.0 * math.pi * 0.31 * t)
 
 
+def observed(p: MotorParameters, **changes: float) -> tuple[Motor, SpeedObserver]:
+    return Motor(p), SpeedObserver(model_of(p), 0.005, ENCODER, **changes)
+
+
 def errors_of(p, observer, dt, duration=2.0, load=0.0, jitter=0.0):
     """Errors of the observer and of differenced counts after the first 0.5 s [rad/s]."""
     rng = np.random.default_rng(3)
@@ -113,13 +117,12 @@ def test_stamps_that_scatter_by_many_counts_are_no_contradiction(late):
 
 
 def test_lost_samples_are_bridged_by_the_model():
-    p, dt = MOTORS["motor 1"], 0.005
-    motor, observer = Motor(p), SpeedObserver(model_of(p), dt, ENCODER)
+    motor, observer = observed(MOTORS["motor 1"])
     errors = []
     for k in range(600):
         lost = 3 if k % 20 == 0 else 1
-        motor.step(6.0, lost * dt)
-        speed = observer.step(ENCODER.count(motor.angle), 6.0, lost * dt)
+        motor.step(6.0, lost * 0.005)
+        speed = observer.step(ENCODER.count(motor.angle), 6.0, lost * 0.005)
         errors.append(speed - motor.speed)
     assert rms(np.array(errors[200:])) < 0.5
     assert observer.trusted
@@ -177,8 +180,7 @@ def test_wrong_model_is_noticed_and_counts_take_over(factor):
 
 
 def test_trust_comes_back_when_model_and_counts_agree_again():
-    p = MOTORS["motor 1"]
-    motor, observer = Motor(p), SpeedObserver(model_of(p), 0.005, ENCODER)
+    motor, observer = observed(MOTORS["motor 1"])
     trusted = []
     for k in range(1200):
         # For a second the motor gets another voltage than is reported.
@@ -193,9 +195,7 @@ def test_trust_comes_back_when_model_and_counts_agree_again():
 
 
 def test_impossible_load_is_not_trusted():
-    p = MOTORS["motor 1"]
-    motor = Motor(p)
-    observer = SpeedObserver(model_of(p), 0.005, ENCODER, max_load=18.0)
+    motor, observer = observed(MOTORS["motor 1"], max_load=18.0)
     trusted = True
     for k in range(1000):
         # The encoder counts backwards: the model needs twice the voltage as a load.
@@ -207,8 +207,7 @@ def test_impossible_load_is_not_trusted():
 
 
 def test_standstill_is_zero_whatever_voltage_sticks():
-    p = MOTORS["motor 1"]
-    motor, observer = Motor(p), SpeedObserver(model_of(p), 0.005, ENCODER)
+    motor, observer = observed(MOTORS["motor 1"])
     for _ in range(400):
         motor.step(0.3, 0.005)  # below the 0.45 V of dry friction
         observer.step(ENCODER.count(motor.angle), 0.3, 0.005)
@@ -230,8 +229,7 @@ def test_sample_that_makes_no_sense_is_refused_and_changes_nothing(bad):
 
 
 def test_long_gap_begins_again_from_the_counts():
-    p = MOTORS["motor 1"]
-    motor, observer = Motor(p), SpeedObserver(model_of(p), 0.005, ENCODER)
+    motor, observer = observed(MOTORS["motor 1"])
     for step in [0.005] * 200 + [3.0] + [0.005] * 200:
         motor.step(6.0, step)
         observer.step(ENCODER.count(motor.angle), 6.0, step)

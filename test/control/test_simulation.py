@@ -7,12 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from paper_motors import combinations_of
-from wheel_simulation import (
-    DriveSettings,
-    Timing,
-    simulate_closed_loop,
-    simulate_open_loop,
-)
+from wheel_simulation import DriveSettings, Timing, simulate_closed_loop, simulate_open_loop
 
 from smp_motor_control import WHEELS
 from smp_motor_control.excitation import Fourier

@@ -2,9 +2,10 @@
 """The limits of a wheel's controller to the sample; steps of 1/64 s, so that times are exact."""
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import pytest
+from wheel_world import Sample
 
 from smp_motor_control.encoder import Encoder
 from smp_motor_control.motor.parameters import Gearbox, MotorModel
@@ -21,14 +22,6 @@ SETTINGS = WheelSettings(
     loop=LoopSettings(gains=GAINS), faults=NO_FAULTS, setpoint_timeout=0.5, feedback_timeout=0.25,
     fault_retry=1.0, implausible_velocity=100.0,
 )  # fmt: skip
-
-
-@dataclass
-class Sample:
-    voltage: float = 0.0
-    current: float = math.nan
-    velocity: float = 0.0
-    encoder_count: int = 0
 
 
 class Feed:
@@ -50,6 +43,20 @@ class Feed:
     def ask(self, value: float, age: float = 0.0) -> None:
         self.wheel.take_setpoint(value, self.now, age)
 
+    def hold(self, value: float, velocity: float, samples: int) -> Fault | None:
+        """Ask before every sample; return the fault at the end."""
+        for _ in range(samples):
+            self.ask(value)
+            self.give(velocity)
+        return self.wheel.recovery.fault
+
+
+def asked(value: float, settings: WheelSettings = SETTINGS) -> Feed:
+    """Return a wheel with a set-point."""
+    feed = Feed(settings)
+    feed.ask(value)
+    return feed
+
 
 def test_a_set_point_as_old_as_its_time_out_counts_and_an_older_one_does_not():
     for age, counts in ((0.5, True), (0.5 + 2.0**-20, False), (-9.0, True)):
@@ -62,16 +69,14 @@ def test_a_set_point_as_old_as_its_time_out_counts_and_an_older_one_does_not():
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 def test_a_set_point_up_to_its_limit_counts(sign):
-    feed = Feed()
-    feed.ask(sign * 1.0001e4)
+    feed = asked(sign * 1.0001e4)
     assert feed.give() == 0.0
     feed.ask(sign * 1e4)
     assert feed.give() == sign * 12.0
 
 
 def test_a_set_point_holds_for_its_time_out_and_then_the_wheel_is_braked():
-    feed = Feed()
-    feed.ask(1.0)
+    feed = asked(1.0)
     for k in range(1, 33):  # half a second
         assert feed.give(1.5) == -1.0, k
         assert feed.wheel.state is State.DRIVING
@@ -82,20 +87,18 @@ def test_a_set_point_holds_for_its_time_out_and_then_the_wheel_is_braked():
 @pytest.mark.parametrize(("transition", "longest"), [(0.0, 1.0), (0.25, 1.0), (60.0, 0.75)])
 def test_a_wheel_that_cannot_be_braked_gets_nothing_after_its_stop_time(transition, longest):
     loop = LoopSettings(gains=GAINS, transition_time=transition, stop_time=longest)
-    feed = Feed(replace(SETTINGS, loop=loop))
-    feed.ask(1.0)
-    asked = feed.now
-    while (voltage := feed.give(1.5)) != 0.0 or feed.now <= asked + 0.5:
+    feed = asked(1.0, replace(SETTINGS, loop=loop))
+    start = feed.now
+    while (voltage := feed.give(1.5)) != 0.0 or feed.now <= start + 0.5:
         pass
-    assert feed.now - asked == 0.5 + longest + DT
+    assert feed.now - start == 0.5 + longest + DT
     assert feed.wheel.state is State.TIMED_OUT and voltage == 0.0
     assert feed.give(1.5) == 0.0 and feed.wheel.setpoint is None
 
 
 @pytest.mark.parametrize(("speed", "at_rest"), [(0.049, True), (-0.049, True), (0.05, False)])
 def test_a_wheel_at_rest_needs_no_brake(speed, at_rest):
-    feed = Feed()
-    feed.ask(0.0)
+    feed = asked(0.0)
     while feed.wheel.state is not State.TIMED_OUT:
         voltage = feed.give(speed)
     assert (voltage == 0.0) is at_rest
@@ -103,8 +106,7 @@ def test_a_wheel_at_rest_needs_no_brake(speed, at_rest):
 
 def test_a_wheel_that_is_braked_along_its_profile_is_not_let_go_before_its_end():
     gains = replace(GAINS, p=1.0, feedforward_velocity=1.0)
-    feed = Feed(replace(SETTINGS, loop=LoopSettings(gains=gains, transition_time=0.5)))
-    feed.ask(1.0)
+    feed = asked(1.0, replace(SETTINGS, loop=LoopSettings(gains=gains, transition_time=0.5)))
     for _ in range(32):
         feed.give(0.0)
     # The sensor says standstill, the reference is still on its way to zero.
@@ -112,18 +114,14 @@ def test_a_wheel_that_is_braked_along_its_profile_is_not_let_go_before_its_end()
 
 
 def test_silence_up_to_the_time_out_is_tolerated_and_a_longer_one_is_named():
-    feed = Feed()
-    feed.ask(1.0)
+    feed = asked(1.0)
     feed.give()
     assert feed.wheel.tick(feed.now + 0.25) is None
     assert feed.wheel.tick(feed.now + 0.25 + DT) == 0.0
     assert feed.wheel.state is State.NO_FEEDBACK
-    for put, state in (
-        ({"age": 0.5}, State.LATE_FEEDBACK),
-        ({"velocity": math.nan}, State.BAD_FEEDBACK),
-    ):
-        feed = Feed()
-        feed.ask(1.0)
+    bad = {"velocity": math.nan}
+    for put, state in (({"age": 0.5}, State.LATE_FEEDBACK), (bad, State.BAD_FEEDBACK)):
+        feed = asked(1.0)
         feed.give()
         feed.now += 0.5  # so that the late stamps increase
         for _ in range(20):
@@ -139,11 +137,8 @@ def test_silence_up_to_the_time_out_is_tolerated_and_a_longer_one_is_named():
 def test_after_silence_the_loop_starts_anew_from_the_speed_that_is():
     loop = LoopSettings(gains=replace(GAINS, i=64.0), transition_time=1.0)
     for gap in ("silence", "late", "owner", "bad", "reset"):
-        feed = Feed(replace(SETTINGS, loop=loop))
-        feed.ask(1.0)
-        for _ in range(16):
-            feed.ask(1.0)
-            feed.give(0.0)
+        feed = asked(1.0, replace(SETTINGS, loop=loop))
+        feed.hold(1.0, 0.0, 16)
         assert feed.wheel.loop.pid.i_term > 0.5
         if gap == "silence":
             feed.now += 1.0
@@ -171,8 +166,7 @@ def test_after_silence_the_loop_starts_anew_from_the_speed_that_is():
 
 def test_speeds_up_to_the_implausible_count_in_both_directions():
     for sign in (1.0, -1.0):
-        feed = Feed()
-        feed.ask(0.0)
+        feed = asked(0.0)
         assert feed.give(sign * 100.0) == -sign * 12.0
         assert feed.give(sign * 100.01) is None
         assert feed.wheel.refused == {"feedback velocity that is not a number or implausible": 1}
@@ -213,8 +207,7 @@ def test_a_clock_that_jumps_begins_the_counted_speed_anew():
 
 
 def test_a_wheel_at_fault_answers_every_sample_with_zero():
-    feed = Feed()
-    feed.ask(1.0)
+    feed = asked(1.0)
     assert feed.give() == 2.0
     feed.wheel.recovery.set(Fault.RUNAWAY, feed.now)
     for _ in range(32):
@@ -250,16 +243,10 @@ def test_the_stall_voltage_is_the_one_that_is_set():
     for stall_voltage, named in ((2.0, Fault.NO_MOTION), (4.0, None)):
         limits = replace(NO_FAULTS, stall_time=0.25, stall_voltage=stall_voltage)
         feed = Feed(replace(SETTINGS, loop=LoopSettings(gains=gains), faults=limits))
-        for _ in range(32):
-            feed.ask(5.0)
-            feed.give(0.0)
-        assert feed.wheel.recovery.fault is named
+        assert feed.hold(5.0, 0.0, 32) is named
     changed = Feed(SETTINGS)
     changed.wheel.configure(replace(SETTINGS, faults=replace(limits, stall_voltage=2.0)))
-    for _ in range(32):
-        changed.ask(5.0)
-        changed.give(0.0)
-    assert changed.wheel.recovery.fault is Fault.NO_MOTION
+    assert changed.hold(5.0, 0.0, 32) is Fault.NO_MOTION
 
 
 def test_an_inactive_wheel_answers_nothing_and_a_reset_forgets_its_set_point():
@@ -284,8 +271,7 @@ def test_an_inactive_wheel_answers_nothing_and_a_reset_forgets_its_set_point():
 
 
 def test_the_terms_of_an_output_are_reported():
-    feed = Feed()
-    feed.ask(1.0)
+    feed = asked(1.0)
     assert feed.give(0.25) == 1.5
     wheel = feed.wheel
     assert (wheel.target, wheel.measurement, wheel.output, wheel.steps) == (1.0, 0.25, 1.5, 1)
@@ -332,10 +318,7 @@ def test_the_speed_expected_at_a_voltage_follows_from_the_feed_forward():
         for speed, fault in ((2.5, Fault.NOT_FOLLOWING), (2.65, None)):
             feed = Feed(settings)
             feed.wheel.configure(known)
-            for _ in range(64):
-                feed.ask(10.0)
-                feed.give(speed)
-            assert feed.wheel.recovery.fault is fault
+            assert feed.hold(10.0, speed, 64) is fault
 
 
 def test_new_parameters_clear_a_computation_fault_and_no_other():
@@ -379,8 +362,7 @@ def test_a_fault_of_the_arithmetic_is_counted_held_and_silent_where_the_wheel_is
         assert feed.give() == (0.0 if active else None)
         assert feed.wheel.refused == {"computation: ZeroDivisionError": 1}
         assert (feed.wheel.recovery.fault is Fault.COMPUTATION) is active
-    feed = Feed()
-    feed.ask(1.0)
+    feed = asked(1.0)
     out = feed.wheel.loop.step(1.0, 0.0, DT)._replace(output=math.nan)
     feed.wheel.loop.step = lambda *_: out
     assert feed.give() == 0.0 and feed.wheel.refused == {"output that is not a number": 1}

@@ -25,6 +25,8 @@ PHYSICAL = {
     "viscous_friction": (2.4e-5, "N m s/rad"),
     "coulomb_friction": (1e-4, "N m"),
 }
+ALIKE = Finding("alike", "warning", "The delay & the inductance look alike at 100 Hz.",
+                advice="Measure the current.")  # fmt: skip
 
 
 def correlation(*values: float) -> Correlation:
@@ -68,14 +70,7 @@ def estimate(wheel: str = "front_left", *, current: bool = True) -> Estimate:
         fit_percent=FitPercent(97.2, 96.8),
         candidates=(Candidate("first_order", 91.0, -10.0, False, "slower lag <b>missed</b>"),),
         residuals=ResidualTests(True, False, correlation(0.01, 0.02), correlation(0.3, 0.1)),
-        findings=(
-            Finding(
-                "alike",
-                "warning",
-                "The delay & the inductance look alike at 100 Hz.",
-                advice="Measure the current.",
-            ),
-        ),
+        findings=(ALIKE,),
         samples=1000,
         duration=10.0,
         sample_time=0.01,

@@ -31,39 +31,20 @@ BAD = {
     "no excitation": (still(0.0), InsufficientExcitationError, "no excitation"),
     "constant input": (still(6.0).slice(N // 2, N), InsufficientExcitationError, "constant at 6 V"),
     "too short": (GOOD.slice(0, 30), InsufficientExcitationError, "too short, 30 samples"),
-    "saturated velocity": (
-        replace(GOOD, count=None, velocity=np.clip(GOOD.velocity, -150, 150)),
-        SignalError,
-        "saturated sensor, velocity",
-    ),
-    "saturated current": (
-        replace(GOOD, current=np.clip(GOOD.current, -0.8, 0.8)),
-        SignalError,
-        "saturated sensor, current",
-    ),
+    "saturated velocity": (replace(GOOD, count=None, velocity=np.clip(GOOD.velocity, -150, 150)),
+                           SignalError, "saturated sensor, velocity"),
+    "saturated current": (replace(GOOD, current=np.clip(GOOD.current, -0.8, 0.8)),
+                          SignalError, "saturated sensor, current"),
     "dead encoder": (replace(GOOD, count=np.zeros(N, int)), SignalError, "dead encoder"),
-    "encoder dies": (
-        replace(GOOD, velocity=None, count=np.minimum(np.arange(N), N // 2) * 0
-                + GOOD.count[np.minimum(np.arange(N), N // 2)]),
-        SignalError,
-        "dead encoder",
-    ),
-    "swapped leads": (
-        replace(GOOD, count=-GOOD.count, velocity=-GOOD.velocity),
-        SignalError,
-        "swapped sign, speed",
-    ),
+    "encoder dies": (replace(GOOD, velocity=None, count=GOOD.count[np.arange(N).clip(max=N // 2)]),
+                     SignalError, "dead encoder"),
+    "swapped leads": (replace(GOOD, count=-GOOD.count, velocity=-GOOD.velocity),
+                      SignalError, "swapped sign, speed"),
     "swapped channels": (replace(GOOD, count=-GOOD.count), SignalError, "swapped sign"),
-    "wrong gear ratio": (
-        replace(GOOD, velocity=GOOD.velocity * 0.5),
-        SignalError,
-        "wrong gear ratio",
-    ),
-    "NaN gaps": (
-        replace(GOOD, count=None, velocity=alternate(GOOD.velocity)),
-        SignalError,
-        "NaN in 60 %",
-    ),
+    "wrong gear ratio": (replace(GOOD, velocity=GOOD.velocity * 0.5),
+                         SignalError, "wrong gear ratio"),
+    "NaN gaps": (replace(GOOD, count=None, velocity=alternate(GOOD.velocity)),
+                 SignalError, "NaN in 60 %"),
 }  # fmt: skip
 
 

@@ -158,10 +158,7 @@ def test_parameters_change_while_driving_or_are_refused(skid_steer, peer, eventu
     # 1 m/s and 2 rad/s ask for 6 and 14 rad/s: both shrink by 3/14 and the path keeps its shape.
     assert peer.set("max_wheel_velocity", 3.0)[0]
     repeatedly(
-        peer,
-        lambda: peer.command(1.0, 2.0),
-        lambda: peer.drives(6.0 * 3.0 / 14.0, 3.0),
-        eventually,
+        peer, lambda: peer.command(1.0, 2.0), lambda: peer.drives(6.0 * 3.0 / 14.0, 3.0), eventually
     )
 
 

@@ -35,11 +35,7 @@ class Terminal:
             fcntl.ioctl(0, termios.TIOCSCTTY, 0)
 
         self.process = subprocess.Popen(
-            command,
-            stdin=self.slave,
-            stdout=self.slave,
-            stderr=self.slave,
-            preexec_fn=adopt,
+            command, stdin=self.slave, stdout=self.slave, stderr=self.slave, preexec_fn=adopt
         )
         # Unread, the terminal's buffer would fill after some hundred lines and block it.
         self._reader = threading.Thread(target=self._read, daemon=True)
@@ -173,13 +169,7 @@ def test_wheel_mode_turns_the_selected_wheel_and_space_stops_it(ready, robot, ev
 
 @pytest.mark.parametrize(
     "leave",
-    [
-        "x",
-        "\x03",
-        "\x1c",
-        signal.SIGTERM,
-        signal.SIGHUP,
-    ],
+    ["x", "\x03", "\x1c", signal.SIGTERM, signal.SIGHUP],
     ids=["x", "Ctrl-C", "Ctrl-backslash", "SIGTERM", "SIGHUP"],
 )
 def test_leaving_stops_the_robot_and_restores_the_terminal(ready, robot, eventually, leave):

@@ -122,11 +122,7 @@ def robot(process, eventually, tmp_path):
     one = Robot()
     one.processes = pids
     try:
-        eventually(
-            one.at_speed,
-            deadline=30.0,
-            message="\n".join(p.output for p in started),
-        )
+        eventually(one.at_speed, deadline=30.0, message="\n".join(p.output for p in started))
         yield one
     finally:
         one.close()

@@ -1,8 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Time: which clock, order, losses, gaps, wrap-around and held inputs."""
 
-import dataclasses
-from typing import Any
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -33,10 +32,6 @@ MANY = settings(
     suppress_health_check=list(HealthCheck),
     phases=(Phase.explicit, Phase.reuse, Phase.generate),
 )
-
-
-def replaced(truth: Any, **changes: Any) -> Any:
-    return dataclasses.replace(truth, **changes)
 
 
 @MANY
@@ -81,7 +76,7 @@ def test_a_mean_voltage_over_a_long_interval_of_irregular_samples_begins_a_segme
     truth = motion(n=200)
     steps = np.where(np.arange(200) % 3, 10_000_000, 19_000_000)
     steps[120] = 400_000_000
-    truth = replaced(truth, time=START + np.cumsum(steps))
+    truth = replace(truth, time=START + np.cumsum(steps))
     record = read(tmp_path / "bag.mcap", truth.messages())
     assert record.starts == (0, 120)
     assert "1 gaps of up to 0.4 s" in notes(record)
@@ -90,7 +85,7 @@ def test_a_mean_voltage_over_a_long_interval_of_irregular_samples_begins_a_segme
 def test_a_few_lost_samples_are_bridged_and_more_begin_a_segment(tmp_path):
     truth = motion(n=400)
     ramp = np.linspace(-10, 10, 400)
-    truth = replaced(truth, voltage=ramp)
+    truth = replace(truth, voltage=ramp)
     lost = [50, 100, 101, *range(200, 205), *range(300, 350)]
     kept = np.setdiff1d(np.arange(400), lost)
     messages = truth.messages()
@@ -115,7 +110,7 @@ def test_late_samples_are_not_taken_for_lost_ones(tmp_path):
     # A stall of four periods, after which the sampler catches up in a burst.
     for k in (60, 200, 330):
         time[k : k + 4] = time[k + 3] + np.arange(4) * 100_000
-    truth = replaced(truth, time=time)
+    truth = replace(truth, time=time)
     record = read(tmp_path / "bag.mcap", truth.messages())
     assert_read(record, truth)
     assert record.starts == (0,)
@@ -136,7 +131,7 @@ def test_samples_without_a_voltage_are_left_out_and_told(tmp_path):
     voltage[[10, 40]] = np.nan, np.inf
     velocity = truth.velocity.copy()
     velocity[70] = np.nan
-    truth = replaced(truth, voltage=voltage, current=current, velocity=velocity)
+    truth = replace(truth, voltage=voltage, current=current, velocity=velocity)
     record = read(tmp_path / "bag.mcap", truth.messages())
     assert len(record) == 98
     assert record.current is None
@@ -156,9 +151,9 @@ def test_header_stamps_days_away_from_the_log_are_used_and_that_is_told(tmp_path
 
 def test_stamps_that_are_not_set_are_not_the_time(tmp_path):
     truth = motion(n=100)
-    unset = replaced(truth, time=np.zeros(100, np.int64))
+    unset = replace(truth, time=np.zeros(100, np.int64))
     messages = [
-        dataclasses.replace(sent, stamp=int(truth.time[k]))
+        replace(sent, stamp=int(truth.time[k]))
         for k, sent in enumerate(unset.messages(description=False))
     ]
     record = read(tmp_path / "bag.mcap", [*truth.messages()[:1], *messages])
@@ -171,8 +166,8 @@ def test_a_clock_that_was_set_back_begins_a_new_segment(tmp_path):
     stamps = truth.time.copy()
     stamps[100:] -= 3_600 * 10**9
     messages = [
-        dataclasses.replace(sent, stamp=int(truth.time[k]))
-        for k, sent in enumerate(replaced(truth, time=stamps).messages(description=False))
+        replace(sent, stamp=int(truth.time[k]))
+        for k, sent in enumerate(replace(truth, time=stamps).messages(description=False))
     ]
     record = read(tmp_path / "bag.mcap", [*truth.messages()[:1], *messages])
     assert record.starts == (0, 100)
@@ -267,9 +262,7 @@ def test_outputs_of_several_topics_come_onto_one_axis(tmp_path):
         floats("/w", fast, np.arange(400) * 0.5),
     )
     record = read(
-        tmp_path / "bag.mcap",
-        messages,
-        "voltage=/u.data position=/pos.data velocity=/w.data",
+        tmp_path / "bag.mcap", messages, "voltage=/u.data position=/pos.data velocity=/w.data"
     )
     assert record.sample_time == pytest.approx(0.01)
     # A straight line is interpolated exactly, but for rounding.
@@ -288,16 +281,14 @@ def test_an_angle_that_wraps_at_a_turn_is_unwrapped(tmp_path):
 
 def test_recordings_of_different_gearboxes_are_not_joined(tmp_path):
     record = read(tmp_path / "bag.mcap", motion(n=20).messages())
-    other = dataclasses.replace(
-        record, hardware=dataclasses.replace(record.hardware, gear_ratio=1.0)
-    )
+    other = replace(record, hardware=replace(record.hardware, gear_ratio=1.0))
     with pytest.raises(BagError, match=r"gear_ratio is 65\.5"):
         join_records([record, other])
 
 
 def test_signals_of_only_some_recordings_are_kept_there(tmp_path):
     record = read(tmp_path / "bag.mcap", motion(n=20).messages())
-    other = dataclasses.replace(record, current=None)
+    other = replace(record, current=None)
     joined = join_records([record, other])
     np.testing.assert_array_equal(joined.current[:20], record.current)
     assert np.isnan(joined.current[20:]).all()
@@ -309,7 +300,7 @@ def test_a_recording_knows_when_it_began_where_its_clock_was_set(tmp_path):
     (record,) = read_records(write_mcap(tmp_path / "a.mcap", truth.messages())).values()
     assert record.recorded == pytest.approx(1e-9 * START, abs=1.0)
     # A computer without a clock battery starts at 1970, which is not a date.
-    early = replaced(truth, time=truth.time - START)
+    early = replace(truth, time=truth.time - START)
     (record,) = read_records(write_mcap(tmp_path / "b.mcap", early.messages())).values()
     assert record.recorded is None
 
@@ -319,7 +310,7 @@ def test_a_clock_that_is_set_forward_begins_a_segment_and_costs_no_time(tmp_path
     truth = motion(n=400)
     leap = round(years * 365.25 * 86_400) * 10**9
     time = truth.time - START
-    truth = replaced(truth, time=time + leap * (np.arange(400) >= 250) + 10**9)
+    truth = replace(truth, time=time + leap * (np.arange(400) >= 250) + 10**9)
     record = read(tmp_path / "bag.mcap", truth.messages())
     assert record.starts == (0, 250)
     assert record.duration < 20.0

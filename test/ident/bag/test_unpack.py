@@ -13,13 +13,7 @@ import pytest
 from backports import zstd
 
 from smp_motor_ident.bag.storage import Channel, join
-from smp_motor_ident.bag.unpack import (
-    Budget,
-    decompress,
-    decompress_messages,
-    pieces,
-    unpack_file,
-)
+from smp_motor_ident.bag.unpack import Budget, decompress, decompress_messages, pieces, unpack_file
 from smp_motor_ident.errors import BagError
 
 PACK: dict[str, Callable[[bytes], bytes]] = {
