@@ -41,8 +41,6 @@ def test_a_dry_run_prints_and_draws_the_plan_and_touches_nothing(tmp_path, capsy
 
 FIGURES = Figures(200.0, 0.001, 0, 0.0, 0.5, 1.0, 1.0, 1.0, 25.0, 0.4, 0.05, 5.0)
 STOP = Finding("reversed", "refused", "left: positive voltage decreases its counts", {}, "swap")
-
-
 GIVEN = "/**/left/wheel_pid:\n  ros__parameters:\n    p: 1.0\n"
 
 

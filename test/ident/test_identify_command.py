@@ -53,10 +53,8 @@ def test_many_short_steps_do_not_run_in_silence(capsys, monkeypatch):
             say("fitting friction")
             threading.Event().wait(0.01)
             said += capsys.readouterr().err
-    assert said.splitlines()[:2] == [
-        "identify: fitting friction (usually 10 s) ...",
-        "identify: fitting friction ...",
-    ]
+    first = "identify: fitting friction (usually 10 s) ..."
+    assert said.splitlines()[:2] == [first, "identify: fitting friction ..."]
 
 
 def test_it_writes_its_three_files_and_recovers_the_motor(recording, tmp_path):

@@ -215,7 +215,7 @@ def test_a_speed_command_mapped_as_a_voltage_is_told(tmp_path, field, severity):
 @pytest.mark.parametrize("still", [False, True])
 def test_a_velocity_that_is_never_filled_in_is_left_out(tmp_path, still):
     """UbiquityRobotics/ubiquity_motor issue 59: the position moves, the velocity is 0."""
-    angle = np.zeros(N) if still else 0.01 * np.cumsum(motion())
+    angle = np.zeros(N) if still else 0.01 * np.cumsum(SPEED)
     path = write(tmp_path / "log.csv", t=T, u=U, p=angle, w=0 * angle)
     record = read_records(path, ["voltage=u position=p velocity=w time=t"])["motor"]
     assert (record.velocity is None) is not still

@@ -97,22 +97,17 @@ def test_a_table_is_read_as_it_states(tmp_path, text, mapping, stated):
 @pytest.mark.parametrize(
     ("above", "separator", "names"),
     [
-        ("# t,u,y", ",", ["t", "u", "y"]),
-        ("# time, u, w", ",", ["time", "u", "w"]),
-        ("# t u y", " ", ["t", "u", "y"]),
-        ("# t, u, y", " ", ["t", "u", "y"]),
-        ("%t\tu\ty", "\t", ["t", "u", "y"]),
-        ("// t;u;y", ";", ["t", "u", "y"]),
+        ("# t,u,y", ",", ["t", "u", "y"]), ("# time, u, w", ",", ["time", "u", "w"]),
+        ("# t u y", " ", ["t", "u", "y"]), ("# t, u, y", " ", ["t", "u", "y"]),
+        ("%t\tu\ty", "\t", ["t", "u", "y"]), ("// t;u;y", ";", ["t", "u", "y"]),
         ("# made by a scope\n# 24 V, at rest\n## t, u, y", ",", ["t", "u", "y"]),
         ("# t,u,y\n# s,mV,deg/s", ",", ["t", "u", "y"]),
         ('# "t [s]","u","y"', ",", ["t [s]", "u", "y"]),
-        ("# made by scope", ",", ["c1", "c2", "c3"]),
-        ("# t,u", ",", ["c1", "c2", "c3"]),
-        ("# t,,y", ",", ["c1", "c2", "c3"]),
-        ("# 0.0,1.0,2.0", ",", ["c1", "c2", "c3"]),
+        ("# made by scope", ",", ["c1", "c2", "c3"]), ("# t,u", ",", ["c1", "c2", "c3"]),
+        ("# t,,y", ",", ["c1", "c2", "c3"]), ("# 0.0,1.0,2.0", ",", ["c1", "c2", "c3"]),
         ("# a,b,c\nt,u,y", ",", ["t", "u", "y"]),
     ],
-)
+)  # fmt: skip
 def test_a_comment_right_above_the_numbers_may_name_the_columns(tmp_path, above, separator, names):
     path = tmp_path / "log.csv"
     path.write_text(above + "\n" + table(separator).partition("\n")[2])

@@ -150,12 +150,7 @@ def test_a_matlab_file_of_another_version_or_cut_off_is_one_line(tmp_path):
 ENTRIES = ("/drive/left volts", "NT:left/speed")
 
 
-def data_log(
-    extra: bytes = b"",
-    metadata: str = "",
-    speed: np.ndarray = SPEED,
-    names: tuple[str, ...] = ENTRIES,
-) -> bytes:
+def data_log(extra=b"", metadata="", speed=SPEED, names=ENTRIES):
     """Return a data log by the published layout: records of few and of many bytes."""
 
     def text(value: str) -> bytes:

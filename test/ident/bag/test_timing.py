@@ -26,12 +26,8 @@ from smp_motor_ident.bag.clock import average_held_input, fit_clock
 from smp_motor_ident.errors import BagError
 
 # Without shrinking, which takes minutes where an example is a whole bag.
-MANY = settings(
-    max_examples=25,
-    deadline=None,
-    suppress_health_check=list(HealthCheck),
-    phases=(Phase.explicit, Phase.reuse, Phase.generate),
-)
+MANY = settings(max_examples=25, deadline=None, suppress_health_check=list(HealthCheck),
+                phases=(Phase.explicit, Phase.reuse, Phase.generate))  # fmt: skip
 
 
 @MANY
