@@ -177,8 +177,9 @@ def test_the_rounding_of_counts_hides_no_step():
     hardware = Hardware(1.0, 64.0, 0, 9.0, None)
     voltage = np.r_[0.0, np.full(t.size - 1, 6.9)]
     found = estimate(Record("motor", t, voltage, count=count, hardware=hardware))
-    # 5 standard deviations: one in 1.7 million
-    motors.check(found, {"time_constant": tau}, sigmas=5.0, most=0.1)
+    # A second lag, which one step hardly shows, is part of the systematic uncertainty.
+    motors.check(found, {"time_constant": tau}, sigmas=1.0, most=0.1, total=True)
+    assert found.value("time_constant") == pytest.approx(tau, rel=0.02)
     assert not found.unreliable
 
 
