@@ -62,10 +62,11 @@ def _shares(voltage: Array, bins: int) -> Array:
 
 
 def _speed(record: Record) -> Array:
-    """Return the motor's speed, from counts where they are known."""
-    per_turn = record.hardware.counts_per_revolution
-    if record.count is not None and per_turn:
-        speed: Array = np.gradient(record.count * (2 * np.pi / per_turn), record.time)
-        return speed
-    assert record.velocity is not None
-    return record.velocity
+    """Return the motor's speed, from counts where they are known, in any unit."""
+    counts = record.count if record.hardware.counts_per_revolution else None
+    if counts is None and record.velocity is not None:
+        return record.velocity
+    turned = counts if counts is not None else record.position
+    turned = record.count if turned is None else turned
+    assert turned is not None  # a record has one of the three
+    return np.asarray(np.gradient(turned.astype(np.float64), record.time))

@@ -137,3 +137,9 @@ def test_demands_do_not_depend_on_the_unit_of_speed():
     record = filled(10.0).record()
     slow = replace(record, velocity=record.velocity * 1e-6, count=None)
     assert missing(slow, Demands()) == missing(record, Demands()) == []
+
+
+def test_demands_are_met_without_a_speed():
+    record = filled(10.0).record()
+    for way in ({"count": None}, {"position": None, "hardware": Hardware()}):
+        assert missing(replace(record, velocity=None, **way), Demands()) == []
