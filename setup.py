@@ -26,6 +26,7 @@ EXECUTABLES = (
     "tune",
     "commission",
     "demo",
+    "lab",
     "serial_driver",
 )
 
@@ -53,6 +54,7 @@ EXTRAS = {
         "distributed>=2024",
         "pyarrow>=14",
     ],  # identify --fleet on a cluster, tables as Parquet
+    "lab": ["aiohttp>=3.9,<4"],  # the page of lab: HTTP and WebSockets in one library
     "xlsx": ["openpyxl>=3.1"],  # Excel workbooks
     "matlab": ["h5py>=3.10"],  # MATLAB files of version 7.3
     "test": [

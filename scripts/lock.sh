@@ -19,9 +19,9 @@ without() {
   awk -v pattern="$2" '/^[^ ]/ { kept = $0 !~ pattern } kept' "$1" >"$1.partial"
   mv "$1.partial" "$1"
 }
-lock wheels.txt 3.10 ../setup.py --extra ros --extra xlsx --extra matlab ros.in dev.in "$@"
+lock wheels.txt 3.10 ../setup.py --extra ros --extra lab --extra xlsx --extra matlab ros.in dev.in "$@"
 # With ROS 2 Jazzy the rest comes from apt, at apt's versions, and must not be hidden by others.
-lock jazzy.txt 3.12 ../setup.py --extra xlsx --extra matlab colcon.in dev.in "$@" --override jazzy-apt.in
+lock jazzy.txt 3.12 ../setup.py --extra lab --extra xlsx --extra matlab colcon.in dev.in "$@" --override jazzy-apt.in
 packaged=$(sed -n 's/^\([a-z0-9-]*\)==.*/\1/p' jazzy-apt.in | paste -sd '|')
 without jazzy.txt "^($packaged)=="
 sed -i "1i # What Ubuntu 24.04 with ROS 2 Jazzy lacks; made by \`make lock\` from setup.py, colcon.in, dev.in less jazzy-apt.in." jazzy.txt

@@ -105,15 +105,15 @@ class Browser:
         elif message.get("method") == "Runtime.consoleAPICalled" and given["type"] == "error":
             self.complaints.append(str(given["args"]))
 
-    def open(self, path: Path, width: int, *, dark: bool = False, height: int = 900) -> None:
-        """Show a file at a width, and wait until it is loaded."""
+    def open(self, page: Path | str, width: int, *, dark: bool = False, height: int = 900) -> None:
+        """Show a file or an address at a width, and wait until it is loaded."""
         self.ask(
             "Emulation.setDeviceMetricsOverride",
             width=width, height=height, deviceScaleFactor=1, mobile=width < 500,
         )  # fmt: skip
         scheme = {"name": "prefers-color-scheme", "value": "dark" if dark else "light"}
         self.ask("Emulation.setEmulatedMedia", features=[scheme])
-        self.ask("Page.navigate", url=path.as_uri())
+        self.ask("Page.navigate", url=page if isinstance(page, str) else page.as_uri())
         while self._read().get("method") != "Page.loadEventFired":
             pass
 

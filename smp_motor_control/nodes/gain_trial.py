@@ -112,8 +112,12 @@ def try_gains(
     trial: float,
     supply: float,
     say: Callable[[str], None] = print,
+    begun: Callable[[], None] = lambda: None,
 ) -> Outcome:
-    """Set parameters in all wheels, watch the loops, and restore all when one misbehaves."""
+    """Set parameters in all wheels, watch the loops, and restore all when one misbehaves.
+
+    ``begun`` is called once the parameters are set.
+    """
     watches = {wheel: LoopWatch(supply) for wheel in values}
     with client.listen(PidState, {f"{w}/pid_state": one.take for w, one in watches.items()}):
         old = client.get_parameters({controller_of(w): list(new) for w, new in values.items()})
@@ -128,20 +132,23 @@ def try_gains(
         client.spin(BASELINE_S)
         for one in watches.values():
             one.begin()
-        begun = time.monotonic()
-        client.set_pending_restore(gains=old)
+        start = time.monotonic()
+        pending_restore = dict(client.pending_restore)
+        gains = {**pending_restore.get("gains", {}), **old}
+        client.set_pending_restore(**{**pending_restore, "gains": gains})
         try:
             client.set_parameters({controller_of(w): new for w, new in values.items()})
+            begun()
             reason = _watch(client, watches, trial)
         except RobotError as error:
             reason = str(error)
     missing = []
     if reason is not None and not _restores(client, old, 1.0):
         missing = [n for n, values in old.items() if not _restores(client, {n: values}, 0.5)]
-    after = time.monotonic() - begun
+    after = time.monotonic() - start
     if missing:
         missing = _wait_for_missing(client, missing, old, say)
-    client.set_pending_restore()
+    client.set_pending_restore(**pending_restore)
     return Outcome(reason or "", after, tuple(missing))
 
 
@@ -172,7 +179,8 @@ def _wait_for_missing(
     say: Callable[[str], None],
 ) -> list[str]:
     """Wait for wheels that do not answer, and restore their gains when they return."""
-    client.set_pending_restore(gains={node: old[node] for node in missing})
+    gains = {node: old[node] for node in missing}
+    client.set_pending_restore(**{**client.pending_restore, "gains": gains})
     names = ", ".join(node.partition("/")[0] for node in missing)
     say(
         f"{names} does not answer; its old gains are restored if it returns within "

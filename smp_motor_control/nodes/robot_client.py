@@ -46,6 +46,7 @@ this client; requests must be idempotent."""
 POLL_PERIOD_S = 0.02
 DECISIVE_SAMPLES = 30  # states of a wheel that show whether one node publishes them
 DISCOVERY_S = 1.0  # discovery time on an idle machine
+HALT_S = 1.5  # halt after which the last commands of others have timed out
 GET, SET = "get_parameters", "set_parameters_atomically"
 
 _RESULTING_STATE = {"configure": "inactive", "activate": "active", "deactivate": "inactive"}
@@ -326,7 +327,11 @@ class RobotClient:
             raise RobotError(f"refused to {transition}: {said}")
 
     def set_pending_restore(self, **pending_restore: Any) -> None:
-        """Note the state to restore, before it is changed: ``active`` nodes and ``gains``."""
+        """Note the state to restore, before it is changed.
+
+        ``halt`` names controllers to deactivate first, ``gains`` parameters of nodes, ``active``
+        the controllers to activate.
+        """
         self.pending_restore = pending_restore
         if self._guarded and self._guard is None and pending_restore:
             self._guard = Guard(self._arguments)
@@ -334,7 +339,11 @@ class RobotClient:
             self._guard.note(pending_restore)
 
     def restore(self, pending_restore: Mapping[str, Any]) -> None:
-        """Set the previous gains and activate the controllers that were active."""
+        """Halt the wheels, set the previous gains and activate the controllers that were active."""
+        states = self.get_states(pending_restore.get("halt", ()))
+        if moving := [node for node, state in states.items() if state == "active"]:
+            self.change_states(moving, "deactivate")
+            self.spin(HALT_S)
         if pending_restore.get("gains"):
             self.set_parameters(pending_restore["gains"])
         if pending_restore.get("active"):

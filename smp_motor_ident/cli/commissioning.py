@@ -84,7 +84,7 @@ def _commission(arguments: argparse.Namespace, folder: Path, known: Mapping[str,
     # The client leaves last: who excites has ended when the controllers are given back.
     with connect(commission.NAME, ros) as client, Processes(folder / "logs") as processes:
         _say("looking for the wheels that report, which takes some 5 s")
-        wheels = tuple(dict.fromkeys(arguments.wheel or ())) or _found(client)
+        wheels = tuple(dict.fromkeys(arguments.wheel or ())) or find_wheels(client)
         robot = steps.Robot(processes, client, wheels or WHEELS, folder, ros, bounds)
         rates = client.wait_for_wheels(robot.wheels, timeout=15.0)
         client.refuse_second_reporters(robot.wheels)
@@ -300,7 +300,7 @@ def _verify(session: Session, designed: driving.Designed) -> str:
     return f"{did}; {'the gains are set in the running controllers' if trial.kept else now}."
 
 
-def _found(client: Any) -> tuple[str, ...]:
+def find_wheels(client: Any) -> tuple[str, ...]:
     """Return the wheels that report; on a busy machine they are discovered seconds apart."""
     looks: list[tuple[str, ...]] = []
     while len(looks) < LOOKS:

@@ -102,7 +102,7 @@ class Processes:
                 signal.signal(number, handler)
 
     def start(self, name: str, node: str, *arguments: str, priority: int = 0) -> None:
-        """Start a node."""
+        """Start a node or a tool, with real-time priority, or, below 0, with less than usual."""
         self._logs.mkdir(parents=True, exist_ok=True)
         parent = os.getpid()
         with (self._logs / f"{name}.log").open("wb") as log, interruption.held():
@@ -121,11 +121,9 @@ class Processes:
         interruption.check()
         for name, process in self._running.items():
             if name != but and process.poll() is not None:
-                log = self._logs / f"{name}.log"
-                lines = log.read_text(errors="replace").strip().splitlines() if log.exists() else []
                 raise ProcessError(
-                    f"{name} ended with exit code {process.returncode}: "
-                    f"{lines[-1] if lines else 'it said nothing'} (log: {log})"
+                    f"{name} ended with exit code {process.returncode}: {self.last_line(name)} "
+                    f"(log: {self._logs / f'{name}.log'})"
                 )
 
     def wait(self, name: str, timeout: float) -> None:
@@ -140,6 +138,21 @@ class Processes:
         if process.returncode != 0:
             self.check()
         del self._running[name]
+
+    def has_ended(self, name: str) -> bool:
+        """Return whether a process has ended."""
+        return name not in self._running or self._running[name].poll() is not None
+
+    def interrupt(self, name: str) -> None:
+        """Ask a process to stop, without waiting for it."""
+        if name in self._running:
+            _signal(self._running[name], signal.SIGINT)
+
+    def last_line(self, name: str) -> str:
+        """Return the last line that a process has printed."""
+        log = self._logs / f"{name}.log"
+        lines = log.read_text(errors="replace").strip().splitlines() if log.exists() else []
+        return lines[-1] if lines else "it said nothing"
 
     def stop(self, *names: str) -> None:
         """Stop processes together, by stronger signals in turn."""
@@ -162,7 +175,7 @@ def _command(node: str) -> list[str]:
         executable = Path(prefix) / "lib" / "smp_motor_control" / node
         if prefix and executable.is_file():
             return [str(executable)]
-    start = f"import sys; from smp_motor_control.entry import node; sys.exit(node({node!r})())"
+    start = f"import sys; from smp_motor_control.entry import {node}; sys.exit({node}())"
     return [sys.executable, "-c", start]
 
 
@@ -173,7 +186,9 @@ def _prepare(parent: int, priority: int) -> None:
         os._exit(1)
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, signal.SIG_DFL)  # a shell's background job ignores SIGINT
-    if priority:
+    if priority < 0:
+        os.nice(-priority)
+    elif priority:
         with contextlib.suppress(PermissionError):
             os.sched_setscheduler(0, os.SCHED_RR, os.sched_param(priority))
 

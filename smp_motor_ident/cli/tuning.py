@@ -47,10 +47,10 @@ def work(arguments: argparse.Namespace) -> int:
     files = _files(arguments)
     check_free(files, arguments.force)
     estimates = read_estimates(arguments.source)
-    wheels, reasons = _design(estimates, arguments)
+    wheels, reasons = design_together(estimates, arguments)
     show(wheels)
     if files:
-        _write(files, wheels, estimates, arguments, reasons)
+        write(files, wheels, estimates, arguments, reasons)
     if arguments.apply:
         gains = {wheel: flatten(parameters(design)) for wheel, design in wheels.designs.items()}
         return applying.apply(gains, arguments)
@@ -101,7 +101,7 @@ def _targets(arguments: argparse.Namespace) -> dict[str, Any]:
     return {n: getattr(arguments, n) for n in tune.TARGETS if getattr(arguments, n) is not None}
 
 
-def _design(
+def design_together(
     estimates: Mapping[str, Estimate], arguments: argparse.Namespace
 ) -> tuple[WheelSet, dict[str, list[str]]]:
     """Return the designs, and the reasons for the delays and sources of speed that they assume."""
@@ -133,7 +133,7 @@ def _taking(text: str, seconds: float, wheels: Sized) -> str:
     return f"{text}, which takes about {seconds * len(wheels):.0f} s"
 
 
-def _write(
+def write(
     files: Sequence[Path],
     wheels: WheelSet,
     estimates: Mapping[str, Estimate],

@@ -16,6 +16,30 @@ from smp_motor_ident.report.drawing import Chart, packed, svg
 
 def page(name: str, charts: Sequence[Chart] | None = None, **content: Any) -> str:
     """Return a page by its template, with the script for ``charts``; content must be complete."""
+    style = text("colors.css") + text("report.css")
+    if charts is not None:
+        style = text("uplot/uPlot.min.css") + style
+        content |= {
+            "charts": charts,
+            "data": script_data(charts),
+            "draw": lambda chart: Markup(svg(chart)),
+            "library": Markup(text("uplot/uPlot.iife.min.js")),
+            "script": Markup(text("charts.js") + text("plots.js")),
+        }
+    return _environment().get_template(name).render(style=Markup(style), **content)
+
+
+def lab_page(nonce: str, wheels: Sequence[str]) -> str:
+    """Return the page of ``lab``, whose script and style run under a nonce."""
+    style = "".join(map(text, ("uplot/uPlot.min.css", "colors.css", "report.css", "lab.css")))
+    scripts = ("uplot/uPlot.iife.min.js", "charts.js", "lab.js")
+    template = _environment().get_template("lab.html.jinja")
+    return template.render(
+        nonce=nonce, wheels=wheels, style=Markup(style), scripts=[Markup(text(s)) for s in scripts]
+    )
+
+
+def _environment() -> jinja2.Environment:
     environment = jinja2.Environment(
         loader=jinja2.PackageLoader("smp_motor_ident.report", "."),
         autoescape=True,
@@ -28,17 +52,7 @@ def page(name: str, charts: Sequence[Chart] | None = None, **content: Any) -> st
         "sentence": words.to_sentence,
         "shares": _keep_together,
     }
-    style = text("colors.css") + text("report.css")
-    if charts is not None:
-        style = text("uplot/uPlot.min.css") + style
-        content |= {
-            "charts": charts,
-            "data": script_data(charts),
-            "draw": lambda chart: Markup(svg(chart)),
-            "library": Markup(text("uplot/uPlot.iife.min.js")),
-            "script": Markup(text("plots.js")),
-        }
-    return environment.get_template(name).render(style=Markup(style), **content)
+    return environment
 
 
 def _keep_together(shares: str) -> Markup:
@@ -54,8 +68,9 @@ def text(name: str) -> str:
 
 def script_data(content: Any) -> Markup:
     """Return data for a script element, which nothing in it may end."""
-    return Markup(msgspec.json.encode(content, enc_hook=_plain).decode().replace("<", "\\u003c"))
+    return Markup(msgspec.json.encode(content, enc_hook=encode_plain).decode().replace("<", "\\u003c"))
 
 
-def _plain(value: Any) -> str | float:
+def encode_plain(value: Any) -> str | float:
+    """Return an array in base64, any other number as it is."""
     return packed(value) if isinstance(value, np.ndarray) else float(value)

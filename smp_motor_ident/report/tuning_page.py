@@ -27,7 +27,6 @@ from smp_motor_ident.tune import (
 from smp_motor_ident.tune.case import prepare, solve
 from smp_motor_ident.tune.curves import Curves, curves
 from smp_motor_ident.tune.designer import finish
-from smp_motor_ident.tune.wheels import at_pace_of
 
 BANDWIDTH_SHARES = (0.3, 0.45, 0.65, 0.85, 1.0)
 """Of the bandwidth that the method chooses by itself, which is the largest integral gain's."""
@@ -90,7 +89,7 @@ def tuning_of(estimate: Estimate, loop: Loop, own: Design) -> Tuning:
     choices = [
         Choice(share * own.margins.crossover, margin, own, curves(estimate, own))
         if share == BANDWIDTH_SHARES[-1] and margin == DEFAULT_PHASE_MARGIN
-        else _choice(estimate, loop, share * own.margins.crossover, margin, own)
+        else choose(estimate, loop, share * own.margins.crossover, margin, own)
         for margin in PHASE_MARGINS
         for share in BANDWIDTH_SHARES
     ]
@@ -103,12 +102,12 @@ def tuning_of(estimate: Estimate, loop: Loop, own: Design) -> Tuning:
     )
 
 
-def _choice(estimate: Estimate, loop: Loop, bandwidth: float, margin: float, own: Design) -> Choice:
+def choose(estimate: Estimate, loop: Loop, bandwidth: float, margin: float, own: Design) -> Choice:
+    """Design for a bandwidth [rad/s] and a phase margin [deg], at the pace of ``own``."""
     asked: dict[str, Any] = dict(bandwidth=bandwidth, phase_margin=margin, samples=BAND_DRAWS)
     try:
         case = prepare(estimate, loop, "margin", {**asked, "together": own.together})
-        found = finish(case, *solve(case))
-        found = at_pace_of(own, case, found) if own.together else found
+        found = finish(case, *solve(case), own.reference if own.together else None)
     except SmpError as error:
         return Choice(bandwidth, margin, reason=str(error))
     return Choice(bandwidth, margin, found, curves(estimate, found))
@@ -130,13 +129,14 @@ def page_data(tunings: Mapping[str, Tuning]) -> dict[str, Any]:
         "shares": BANDWIDTH_SHARES,
         "margins": PHASE_MARGINS,
         "wheels": {
-            wheel: dict(chosen=t.chosen, reason=t.reason, choices=[*map(_document, t.choices)])
+            wheel: dict(chosen=t.chosen, reason=t.reason, choices=[*map(describe, t.choices)])
             for wheel, t in tunings.items()
         },
     }
 
 
-def _document(one: Choice) -> dict[str, Any]:
+def describe(one: Choice) -> dict[str, Any]:
+    """Return a choice as the page's script takes it."""
     asked = {"bandwidth": words.number(one.bandwidth), "margin": f"{one.phase_margin:g}"}
     if one.design is None or one.curves is None:
         return {**asked, "reason": one.reason}

@@ -112,16 +112,29 @@ def design(estimate: Estimate, loop: Loop, method: str = "margin", **targets: An
     return finish(case, *solve(case))
 
 
-def finish(case: Case, feedback: Feedback, factor: float, robustness: Robustness) -> Design:
-    """Add feed-forward, reference, figures and words to gains scaled by ``factor``."""
+def finish(
+    case: Case,
+    feedback: Feedback,
+    factor: float,
+    robustness: Robustness,
+    lead: Reference | None = None,
+) -> Design:
+    """Add feed-forward, reference, figures and words to gains scaled by ``factor``.
+
+    The reference is that of ``lead``, if given, or as slow as these gains need.
+    """
     problem, plant, loop = case.problem, case.problem.plant, case.problem.loop
     controller = controller_for(loop, feedback)
     margins = loop_margins(plant, feedback)
     quickest = _plan(case, controller, margins)
-    free = "transition_time" not in problem.targets
-    reference, figures, bands = _select_reference(
-        quickest, _simulation(case, controller, margins), free
-    )
+    simulated = _simulation(case, controller, margins)
+    if lead is None:
+        free = "transition_time" not in problem.targets
+        reference, figures, bands = _select_reference(quickest, simulated, free)
+    else:
+        slower = max(lead.transition_time, quickest.transition_time)
+        reference = replace(lead, transition_time=slower)
+        figures, bands = simulated(reference)
     reason, findings = _explain(case, margins, factor, robustness, (figures, bands))
     m = plant.motors
     return Design(

@@ -259,15 +259,19 @@ class StepFigures:
     peak_voltage: float  # largest magnitude [V]
 
 
-def find_last_exit(time: Array, outside: NDArray[np.bool_]) -> float:
-    """Return when a signal is outside of its band no more; NaN where it is at the end."""
-    last = int(np.flatnonzero(outside)[-1]) if np.any(outside) else -1
-    return float(time[last + 1]) if last + 1 < time.size else math.nan
+def find_last_exit(time: Array, outside: NDArray[np.bool_]) -> Array:
+    """Return when signals, shape (..., k), are outside of their band no more.
+
+    NaN where one is at the end.
+    """
+    inside = np.argmax(outside[..., ::-1], axis=-1)
+    begin = np.where(outside.any(axis=-1), time.size - inside, 0)
+    return np.append(time, math.nan)[begin]
 
 
 def settling_time(time: Array, answer: Array, tolerance: float = SETTLING_BAND.value) -> float:
     """Return when the answer to a unit change stays within a tolerance of 1; NaN where never."""
-    return find_last_exit(time, np.abs(answer - 1.0) > tolerance)
+    return float(find_last_exit(time, np.abs(answer - 1.0) > tolerance))
 
 
 def step_figures(time: Array, speed: Array, voltage: Array, final: float) -> StepFigures:

@@ -243,7 +243,7 @@ def _performance(
         step_overshoot=abrupt.overshoot,
         load_peak=float(loss.max()),
         load_integral=float(np.trapezoid(loss, time)),
-        load_recovery=find_last_exit(time, loss > 0.1 * loss.max()),
+        load_recovery=float(find_last_exit(time, loss > 0.1 * loss.max())),
         peak_voltage=planned.peak_voltage,
         control_noise=control_noise,
     )

@@ -28,6 +28,7 @@ References
 .. [2] G. Ellis, Control System Design Guide, 4th ed. (2012), chapter 16: resonances.
 """
 
+import functools
 import math
 from dataclasses import dataclass
 
@@ -44,7 +45,7 @@ from smp_motor_ident.tune.limits import (
     UNKNOWN_RESPONSE_ERROR,
 )
 from smp_motor_ident.tune.plant import Plant
-from smp_motor_ident.tune.simulation import settling_time
+from smp_motor_ident.tune.simulation import find_last_exit, settling_time
 
 FREQUENCY_COUNT = 40  # number of resonance frequencies, from the lowest of the bound up to Nyquist
 
@@ -116,27 +117,41 @@ def added_by_resonance(
     if unmodelled is None:
         return 0.0, 0.0
     T = plant.sample_time
-    nyquist = math.pi / T
-    lowest = min(float(unmodelled.frequency[0]), 0.5 * nyquist)
-    at = np.geomspace(lowest, 0.98 * nyquist, FREQUENCY_COUNT, dtype=np.float64)
     ringing = -math.log(SETTLING_BAND.value) / (RESONANCE_DAMPING.value * unmodelled.known * T)
     n = 2 ** math.ceil(math.log2(min(max(answer.size + ringing, SHORTEST), LONGEST)))
     usual = np.pad(answer, (0, n - answer.size), mode="edge")
     time = T * np.arange(n, dtype=np.float64)
     omega = np.asarray(2 * np.pi * np.fft.rfftfreq(n, T)[1:], dtype=np.float64)
     complementary, moved = _loop(plant, feedback, omega, usual)
-    ends, highest = [settling_time(time, usual)], usual.max()
-    for damping in DAMPINGS:
-        error = (
-            compute_modes(omega, at, damping, T)
-            * find_largest_modes(unmodelled, at, damping, T)[:, None]
-        )
+    settled, highest = settling_time(time, usual), usual.max()
+    ends = [settled]
+    for error in _largest_errors(unmodelled.frequency.tobytes(), unmodelled.bound.tobytes(), T, n):
         for D in (error, -error):
             spectrum = np.pad(D * moved / (1 + D * complementary), ((0, 0), (1, 0)))
             rows = usual + np.fft.irfft(spectrum, n)
             highest = max(highest, rows.max())
-            ends += [settling_time(time, row) for row in rows]
-    return float(highest - usual.max()), float(np.max(ends) - ends[0])
+            ends.append(np.max(find_last_exit(time, np.abs(rows - 1.0) > SETTLING_BAND.value)))
+    return float(highest - usual.max()), float(np.max(ends) - settled)
+
+
+@functools.lru_cache(maxsize=4)
+def _largest_errors(
+    frequency: bytes, bound: bytes, sample_time: float, length: int
+) -> list[Complex]:
+    """Return the errors of the largest resonances, shape (frequency, omega), for each damping.
+
+    They are the same for all gains of a wheel, so that those of the last wheels are kept.
+    """
+    unmodelled = UnmodelledDynamics(np.frombuffer(frequency), np.frombuffer(bound))
+    nyquist = math.pi / sample_time
+    lowest = min(float(unmodelled.frequency[0]), 0.5 * nyquist)
+    at = np.geomspace(lowest, 0.98 * nyquist, FREQUENCY_COUNT, dtype=np.float64)
+    omega = np.asarray(2 * np.pi * np.fft.rfftfreq(length, sample_time)[1:], dtype=np.float64)
+    return [
+        compute_modes(omega, at, damping, sample_time)
+        * find_largest_modes(unmodelled, at, damping, sample_time)[:, None]
+        for damping in DAMPINGS
+    ]
 
 
 def compute_modes(omega: Array, at: Array, damping: float, sample_time: float) -> Complex:

@@ -66,12 +66,6 @@ def _with(case: Case, shared: Feedback) -> Design:
     return finish(case, mine, 1.0, case.ensemble.assess(mine))
 
 
-def at_pace_of(lead: Design, case: Case, one: Design) -> Design:
-    """Return another design of the same wheel with the reference of one, or as slow as it needs."""
-    slower = max(lead.reference.transition_time, one.reference.transition_time)
-    return with_reference(case, one, replace(lead.reference, transition_time=slower))
-
-
 def _together(
     cases: Mapping[str, Case], own: Mapping[str, Design]
 ) -> tuple[dict[str, Design], str]:

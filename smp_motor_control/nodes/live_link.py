@@ -1,0 +1,258 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Streams of a running robot in batches, and commands to it under a watchdog.
+
+A :class:`LiveLink` works in a timer of the client's node, which runs whenever the client waits.
+"""
+
+import math
+import time
+from collections.abc import Mapping, Sequence
+from functools import partial
+from typing import Protocol
+
+import numpy as np
+from diagnostic_msgs.msg import DiagnosticArray
+from geometry_msgs.msg import TwistStamped
+from lifecycle_msgs.msg import Transition
+from lifecycle_msgs.srv import ChangeState
+from rclpy.qos import QoSProfile, ReliabilityPolicy
+from sensor_msgs.msg import JointState
+
+from smp_interfaces.msg import MotorDescription, MotorParameters, MotorState, PidState
+from smp_motor_control import controller_of, joint_of
+from smp_motor_control.arrays import Array
+from smp_motor_control.nodes import runtime
+from smp_motor_control.nodes.executor import OwnerReads
+from smp_motor_control.nodes.robot_client import RobotClient
+
+COLUMNS = ("voltage", "current", "speed", "setpoint", "reference", "prediction")
+"""Quantities of a wheel: V, A, and the rest in rad/s at the wheel; NaN where there is none."""
+
+SLOT_S = 0.005  # interval of the common time grid; the last sample in it counts
+MAX_LATE_SLOTS = 4  # slots by which one wheel's samples may come after another's
+FRAME_S = 1 / 30  # period of batches and of commands
+KEPT_S = 60.0  # length of the kept history
+COMMAND_S = 0.3  # age at which a command, or the connection of its sender, counts as lost
+ZERO_S = 1.0  # duration of zero commands after a drive
+DIAGNOSTICS_S = 3.0  # age at which a report is dropped
+
+_QUEUE = QoSProfile(depth=500, reliability=ReliabilityPolicy.BEST_EFFORT)
+
+Plan = Sequence[tuple[float, float]]
+"""Set-points of a wheel: seconds since the begin, and rad/s from then on."""
+
+
+def decode(messages: Sequence[bytes], count: int) -> tuple[Array, Array]:
+    """Return stamps [s] and the first ``count`` numbers of serialized messages with a header.
+
+    References
+    ----------
+    OMG DDSI-RTPS 2.5, section 10 (CDR, little endian): numbers of 8 bytes follow the frame's name
+    at a multiple of 8 after the encapsulation of 4 bytes.
+    """
+    length = len(messages[-1])
+    alike = [one for one in messages if len(one) == length]
+    data = np.frombuffer(b"".join(alike), np.uint8).reshape(len(alike), length)
+    name = int.from_bytes(messages[-1][12:16], "little")
+    begin = 4 + -(-(12 + name) // 8) * 8
+    seconds, nanoseconds = (data[:, k : k + 4].copy().view("<u4")[:, 0] for k in (4, 8))
+    numbers = data[:, begin : begin + 8 * count].copy().view("<f8")
+    return seconds + 1e-9 * nanoseconds, numbers
+
+
+class History:
+    """The last minute of all wheels on a common time grid, shape (slots, wheels, columns)."""
+
+    def __init__(self, wheels: int) -> None:
+        self._rows = np.full((int(KEPT_S / SLOT_S), wheels, len(COLUMNS)), math.nan)
+        self._newest = self._told = -1
+        self.origin = -1  # slot that counts as 0
+
+    def add(self, wheel: int, columns: slice, stamps: Array, values: Array) -> None:
+        """Put samples of one wheel into their slots."""
+        slots = (stamps / SLOT_S).astype(np.int64)
+        size, newest = len(self._rows), int(slots[-1])
+        if not 0 <= newest - self._newest < size and abs(newest - self._newest) > MAX_LATE_SLOTS:
+            self._rows[:] = math.nan  # the first samples, or the clock was set
+            self._newest = self._told = newest
+            self.origin = newest if self.origin < 0 else self.origin
+        elif newest > self._newest:
+            self._rows[np.arange(self._newest + 1, newest + 1) % size] = math.nan
+            self._newest = newest
+        self._rows[slots % size, wheel, columns] = values
+
+    def take(self) -> tuple[Array, Array]:
+        """Return slots since the last call and their rows, without rows that hold nothing."""
+        end = max(self._newest - MAX_LATE_SLOTS, self._told)
+        slots, self._told = np.arange(self._told + 1, end + 1), end
+        rows = self._rows[slots % len(self._rows)]
+        some = np.isfinite(rows[:, :, :3]).any(axis=(1, 2))
+        return slots[some], rows[some]
+
+    def since(self, slot: int) -> tuple[Array, Array]:
+        """Return the slots from ``slot`` on, and their rows."""
+        first = max(slot, self._newest - len(self._rows) + 1)
+        slots = np.arange(first, self._newest + 1)
+        return slots, self._rows[slots % len(self._rows)]
+
+    @property
+    def now(self) -> int:
+        """The newest slot."""
+        return self._newest
+
+
+class Listener(Protocol):
+    """Receiver of a link's events."""
+
+    def on_frame(self, slots: Array, rows: Array) -> None:
+        """Take a batch of samples, shape (slots,) and (slots, wheels, columns)."""
+
+    def on_learned(self, wheel: str, message: MotorParameters) -> None:
+        """Take an estimate of a wheel's motor."""
+
+    def on_halt(self, reason: str) -> None:
+        """Take the reason for which the wheels were stopped."""
+
+    def on_tick(self) -> None:
+        """Act once a period."""
+
+
+class LiveLink:
+    """Streams and commands of the wheels of one robot."""
+
+    def __init__(self, client: RobotClient, wheels: Sequence[str], listener: Listener) -> None:
+        self._client, self.wheels, self._listener = client, tuple(wheels), listener
+        self.history = History(len(wheels))
+        self.hardware: dict[str, MotorDescription] = {}
+        self.diagnostics: dict[str, tuple[float, int, str]] = {}
+        self.armed = self.controlled = False  # whether commands pass; controllers are active
+        self.heard_at = -math.inf  # when the driver's page was last heard
+        self._halt, self._ticked = "", 0.0
+        self._plans: tuple[float, Mapping[str, Plan], float] | None = None
+        self._body = (0.0, 0.0, -math.inf)  # m/s, rad/s, when commanded
+        node = client.node
+        self._streams = [
+            (kind, numbers, k, columns, node.create_subscription(
+                kind, f"{wheel}/{topic}", lambda _: None, _QUEUE, raw=True,
+                callback_group=OwnerReads(),
+            ))
+            for k, wheel in enumerate(wheels)
+            for kind, topic, numbers, columns in (
+                (MotorState, "motor_state", 3, slice(0, 3)),
+                (PidState, "pid_state", 2, slice(3, 5)),
+            )
+        ]  # fmt: skip
+        for wheel in wheels:
+            for kind, topic, take in (
+                (MotorDescription, "motor_description", partial(self.hardware.__setitem__, wheel)),
+                (MotorParameters, "motor_parameters", partial(listener.on_learned, wheel)),
+            ):
+                node.create_subscription(kind, f"{wheel}/{topic}", take, runtime.LATCHED)
+        node.create_subscription(DiagnosticArray, "/diagnostics", self._on_diagnostics, 100)
+        self._twist = TwistStamped()
+        self._twist.header.frame_id = "base_link"
+        self._setpoint = JointState(name=[joint_of(wheel) for wheel in wheels])
+        stream = runtime.STREAM_PUBLISHER
+        self._twists = node.create_publisher(TwistStamped, "cmd_vel", stream)
+        self._setpoints = node.create_publisher(JointState, "wheel_setpoints", stream)
+        self._switches = [
+            node.create_client(ChangeState, f"{controller_of(wheel)}/change_state")
+            for wheel in wheels
+        ]
+        runtime.steady_timer(node, FRAME_S, self._on_timer)
+
+    # Commands; halt and drive may come from any thread ---------------------------------------
+
+    def halt(self, reason: str) -> None:
+        """Stop the wheels within a period and refuse commands until they are armed again."""
+        self._halt = self._halt or reason
+
+    def drive(self, linear: float, angular: float) -> None:
+        """Command the body [m/s], [rad/s]; it stops when no further command comes."""
+        if self.armed and math.isfinite(linear + angular):
+            self._body = linear, angular, time.monotonic()
+
+    def follow(self, plans: Mapping[str, Plan], duration: float = math.inf) -> None:
+        """Send set-points by plans, and zero to the other wheels, for a time [s]."""
+        if self.armed:
+            self._plans = time.monotonic(), plans, duration
+
+    def rest(self) -> None:
+        """End what :meth:`follow` began with a set-point of zero."""
+        if self._plans is not None:
+            self._plans = None
+            self._send_setpoints({})
+
+    def can_drive(self) -> bool:
+        """Return whether a node takes cmd_vel."""
+        return bool(self._twists.get_subscription_count())
+
+    # The timer -------------------------------------------------------------------------------
+
+    def _on_timer(self) -> None:
+        now = time.monotonic()
+        self._read()
+        late, self._ticked = now - self._ticked > COMMAND_S / 2, now
+        # After a pause of this process the sender may have been heard, and not been noted yet.
+        if self.armed and not late and now - self.heard_at > COMMAND_S:
+            self.halt(f"the page was not heard for {COMMAND_S:g} s")
+        if self._halt:
+            self._stop_wheels()
+        linear, angular, at = self._body
+        if now - at < COMMAND_S + ZERO_S:
+            fresh = now - at < COMMAND_S
+            self._send_twist(*((linear, angular) if fresh else (0.0, 0.0)))
+        if self._plans is not None:
+            begun, plans, duration = self._plans
+            since = now - begun
+            if since > duration:
+                self.rest()
+            else:
+                self._send_setpoints({
+                    wheel: next((v for t, v in reversed(plan) if since >= t), 0.0)
+                    for wheel, plan in plans.items()
+                })  # fmt: skip
+        self._listener.on_tick()
+
+    def _read(self) -> None:
+        for kind, numbers, wheel, columns, stream in self._streams:
+            messages, handle = [], stream.handle
+            with handle:
+                while (taken := handle.take_message(kind, True)) is not None:
+                    messages.append(taken[0])
+            if messages:
+                self.history.add(wheel, columns, *decode(messages, numbers))
+        if self.history.now >= 0:
+            slots, rows = self.history.take()
+            if slots.size:
+                self._listener.on_frame(slots, rows)
+
+    def _stop_wheels(self) -> None:
+        reason, self._halt, self.armed, self._plans = self._halt, "", False, None
+        self._body = (0.0, 0.0, self._body[2])  # zero for as long as it would have driven
+        self._send_setpoints({})
+        if self.controlled:
+            self.controlled = False
+            request = ChangeState.Request(transition=Transition(id=Transition.TRANSITION_DEACTIVATE))
+            for switch in self._switches:
+                if switch.service_is_ready():
+                    switch.call_async(request)
+        self._listener.on_halt(reason)
+
+    def _send_twist(self, linear: float, angular: float) -> None:
+        self._twist.header.stamp = self._client.node.get_clock().now().to_msg()
+        self._twist.twist.linear.x, self._twist.twist.angular.z = linear, angular
+        self._twists.publish(self._twist)
+
+    def _send_setpoints(self, speeds: Mapping[str, float]) -> None:
+        self._setpoint.header.stamp = self._client.node.get_clock().now().to_msg()
+        self._setpoint.velocity = [float(speeds.get(wheel, 0.0)) for wheel in self.wheels]
+        self._setpoints.publish(self._setpoint)
+
+    def _on_diagnostics(self, message: DiagnosticArray) -> None:
+        now = time.monotonic()
+        for one in message.status:
+            self.diagnostics[one.name] = now, ord(one.level), one.message
+        for name, (at, *_) in list(self.diagnostics.items()):
+            if now - at > DIAGNOSTICS_S:
+                del self.diagnostics[name]

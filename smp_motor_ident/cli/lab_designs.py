@@ -1,0 +1,140 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Designs for the page of ``lab``, computed in a process of their own.
+
+The functions at the end run in that process, which keeps the motors and their designs.
+"""
+
+import math
+import multiprocessing
+import os
+from collections.abc import Callable
+from concurrent.futures import Future, ProcessPoolExecutor
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from smp_motor_control.parameter_file import flatten
+from smp_motor_ident.cli import tune, tuning
+from smp_motor_ident.cli.workers import end_with_parent
+from smp_motor_ident.errors import DesignError, SmpError
+from smp_motor_ident.report import tuning_page
+from smp_motor_ident.report.tuning_page import Choice
+from smp_motor_ident.result import Estimate
+from smp_motor_ident.tune import Design
+from smp_motor_ident.tune.case import prepare
+from smp_motor_ident.tune.curves import curves
+from smp_motor_ident.tune.designer import finish
+from smp_motor_ident.tune.feedback import Feedback
+from smp_motor_ident.tune.reference import STEP_SHARE
+from smp_motor_ident.tune.writing import parameters
+
+NICENESS = 5  # of the process that designs
+
+
+class Designs:
+    """The process that designs, for a ``with`` block."""
+
+    def __enter__(self) -> "Designs":
+        """Start the process, which loads its modules meanwhile."""
+        spawn = multiprocessing.get_context("spawn")
+        self._pool = ProcessPoolExecutor(1, mp_context=spawn, initializer=_begin)
+        self._pool.submit(int)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """End the process."""
+        self._pool.shutdown(cancel_futures=True)
+
+    def submit(self, work: Callable[..., Any], *given: Any) -> Future[Any]:
+        """Let the process do some work."""
+        return self._pool.submit(work, *given)
+
+
+def _begin() -> None:
+    end_with_parent()
+    os.nice(NICENESS)  # the robot goes first
+
+
+@dataclass
+class _Motors:
+    """Motors and the designs of ``tune``."""
+
+    estimates: dict[str, Estimate]
+    own: dict[str, Design]
+
+
+_motors = _Motors({}, {})
+
+
+def design(identified: Path, output: Path, accept_unreliable: bool) -> dict[str, Any]:
+    """Do what ``tune IDENTIFIED --output OUTPUT`` does; return every wheel's design and reason."""
+    given = [str(identified), "--output", str(output)]
+    arguments = tune.parser().parse_args(
+        [*given, *(["--accept-unreliable"] if accept_unreliable else [])]
+    )
+    estimates = tuning.read_estimates(identified)
+    wheels, reasons = tuning.design_together(estimates, arguments)
+    files = [output, output.with_suffix(".json"), output.with_suffix(".svg")]
+    tuning.write(files, wheels, estimates, arguments, reasons)
+    _motors.estimates, _motors.own = estimates, dict(wheels.designs)
+    margin = tuning_page.DEFAULT_PHASE_MARGIN
+    choices = {
+        wheel: Choice(one.margins.crossover, margin, one, curves(estimates[wheel], one))
+        for wheel, one in wheels.designs.items()
+    }
+    shown = {wheel: tuning_page.Tuning(wheel, [choice], 0) for wheel, choice in choices.items()}
+    return {
+        "reason": wheels.reason,
+        "charts": tuning_page.page_charts(shown),
+        "designs": {wheel: _describe(wheel, choice) for wheel, choice in choices.items()},
+    }
+
+
+def choose(wheel: str, share: float, phase_margin: float) -> dict[str, Any]:
+    """Design one wheel for a share of its largest bandwidth and a phase margin [deg]."""
+    own = _motors.own[wheel]
+    bandwidth = share * own.margins.crossover
+    asked = _motors.estimates[wheel], own.loop, bandwidth, phase_margin, own
+    return _describe(wheel, tuning_page.choose(*asked))
+
+
+def judge(wheel: str, p: float, i: float, d: float) -> dict[str, Any]:
+    """Return what gains [V per wheel rad/s] that were set by hand do."""
+    estimate, own = _motors.estimates[wheel], _motors.own[wheel]
+    ratio = own.loop.gear_ratio
+    feedback = Feedback(p / ratio, i / ratio, d / ratio, own.feedback.filter_time)
+    given = {"samples": tuning_page.BAND_DRAWS, "together": own.together}
+    choice = Choice(math.nan, math.nan)
+    try:
+        case = prepare(estimate, own.loop, "margin", given)
+        robustness = case.ensemble.assess(feedback)
+        if robustness.stable < 1.0:
+            share = 100 * (1 - robustness.stable)
+            raise DesignError(
+                f"{wheel}: with these gains the loop is unstable for {share:.0f} % of the motors "
+                "within the uncertainty; lower p, i or d"
+            )
+        lead = own.reference if own.together else None
+        found = finish(case, feedback, 1.0, robustness, lead)
+        found = replace(found, reason="p, i and d set by hand")
+        choice = replace(choice, design=found, curves=curves(estimate, found))
+    except SmpError as error:
+        choice = replace(choice, reason=str(error))
+    return _describe(wheel, choice)
+
+
+def _describe(wheel: str, choice: Choice) -> dict[str, Any]:
+    """Return a design as the page and the robot take it."""
+    found = choice.design
+    made = {**tuning_page.describe(choice), "wheel": wheel}
+    if found is None or choice.curves is None:
+        return made
+    return {
+        **made,
+        "crossover": found.margins.crossover,
+        "phase_margin": found.margins.phase,
+        "gains": [found.gains.p, found.gains.i, found.gains.d],
+        "change": STEP_SHARE * found.wheel_reference.max_velocity,
+        "settling": found.settling.value,
+        "parameters": flatten(parameters(found)),
+    }

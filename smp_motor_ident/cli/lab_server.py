@@ -1,0 +1,303 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Serve the page of ``lab``: one page drives, others watch.
+
+A token opens one page; a cookie of that browser and the page's own address are asked for after.
+The page that drives is heard every 0.1 s, or the wheels stop.
+"""
+
+import asyncio
+import concurrent.futures
+import ipaddress
+import json
+import math
+import os
+import secrets
+import threading
+import time
+import webbrowser
+from collections.abc import Awaitable, Callable
+from typing import Any
+
+import msgspec
+from aiohttp import WSMsgType, web
+
+from smp_motor_control.errors import SmpError
+from smp_motor_ident.cli import lab_designs
+from smp_motor_ident.cli.laboratory import Laboratory
+from smp_motor_ident.cli.processes import ProcessError
+from smp_motor_ident.errors import ParameterError
+from smp_motor_ident.report import templates
+
+QUEUED = 60  # messages that wait for a slow page before it is closed
+MAX_MESSAGE = 10_000  # length of a request [bytes]
+ABANDONED_S = 2.0  # silence after which another page may take the place of the one that drives
+HEADERS = {
+    "Referrer-Policy": "no-referrer",
+    "X-Content-Type-Options": "nosniff",
+    "Cache-Control": "no-store",
+}
+POLICY = (
+    "default-src 'none'; script-src 'nonce-{0}'; style-src 'nonce-{0}'; connect-src 'self'; "
+    "worker-src blob:; "
+    "img-src data: blob:; frame-src 'self'; base-uri 'none'; form-action 'none'; "
+    "frame-ancestors 'none'"
+)
+REPORT_POLICY = "sandbox allow-scripts; frame-ancestors 'self'"  # its scripts reach nothing here
+
+
+class Page:
+    """One connected page."""
+
+    def __init__(self, socket: web.WebSocketResponse) -> None:
+        self.socket = socket
+        self.queue: asyncio.Queue[str | bytes] = asyncio.Queue(QUEUED)
+        self.heard_at = time.monotonic()
+
+    def put(self, message: str | bytes) -> None:
+        """Queue a message; a page that cannot keep up is closed."""
+        try:
+            self.queue.put_nowait(message)
+        except asyncio.QueueFull:
+            asyncio.ensure_future(self.socket.close(code=1013, message=b"too slow"))
+
+    async def write(self) -> None:
+        """Send what is queued."""
+        while not self.socket.closed:
+            message = await self.queue.get()
+            if isinstance(message, bytes):
+                await self.socket.send_bytes(message)
+            else:
+                await self.socket.send_str(message)
+
+
+class Server:
+    """The server, in a thread of its own, for a ``with`` block."""
+
+    def __init__(self, laboratory: Laboratory, host: str, port: int, browse: bool) -> None:
+        self._laboratory, self._host, self._port, self._browse = laboratory, host, port, browse
+        self._pages: list[Page] = []
+        self._driver: Page | None = None
+        self._session, self._token = secrets.token_urlsafe(32), ""
+        self._last: dict[str, str] = {}  # the newest message of each kind, for pages that join
+        self._loop = asyncio.new_event_loop()
+        self._ended = asyncio.Event()
+
+    def __enter__(self) -> "Server":
+        """Start, and print the address."""
+        ready: concurrent.futures.Future[None] = concurrent.futures.Future()
+        run = self._serve(ready)
+        self._thread = threading.Thread(target=self._loop.run_until_complete, args=(run,), daemon=True)
+        self._thread.start()
+        ready.result()
+        self._laboratory.send = self._send
+        if not _is_loopback(self._host):
+            print(
+                f"WARNING: served on {self._host}: whoever has the address below and reaches this "
+                "machine can drive the robot, and the connection is not encrypted. Leave out --host"
+                " to serve this machine only",
+                flush=True,
+            )
+        self._invite()
+        if self._browse and (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
+            webbrowser.open(self._address())
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Close all pages."""
+        self._loop.call_soon_threadsafe(self._ended.set)
+        self._thread.join(5.0)
+
+    async def _serve(self, ready: "concurrent.futures.Future[None]") -> None:
+        app = web.Application(middlewares=[self._guard])
+        app.add_routes([
+            web.get("/", self._page), web.get("/ws", self._talk),
+            web.get("/results/{name}/{file}", self._result),
+        ])  # fmt: skip
+        runner = web.AppRunner(app, access_log=None, shutdown_timeout=1.0)
+        await runner.setup()
+        try:
+            site = web.TCPSite(runner, self._host, self._port)
+            await site.start()
+            self._port = runner.addresses[0][1]
+            ready.set_result(None)
+            await self._ended.wait()
+        except OSError as error:
+            where = f"{self._host}:{self._port}"
+            ready.set_exception(ProcessError(f"{where}: {error.strerror}; choose another --port"))
+        finally:
+            for page in list(self._pages):
+                await page.socket.close(code=1001, message=b"lab ended")
+            await runner.cleanup()
+
+    # Access ---------------------------------------------------------------------------------------
+
+    def _address(self) -> str:
+        host = "127.0.0.1" if self._host in ("0.0.0.0", "::") else self._host
+        return f"http://{f'[{host}]' if ':' in host else host}:{self._port}/?token={self._token}"
+
+    def _invite(self) -> None:
+        """Print the address of one more page; its token is good for one use."""
+        self._token = secrets.token_urlsafe(16)
+        print(f"lab: open {self._address()}", flush=True)
+
+    def _is_own(self, host: str) -> bool:
+        """Return whether a host is this server's: names of others are bound to it by an attack."""
+        name, _, port = host.rpartition(":")
+        name = name.strip("[]")
+        own = {self._host, "localhost", "127.0.0.1", "::1"}
+        return port == str(self._port) and (
+            name in own or (not _is_loopback(self._host) and _is_address(name))
+        )
+
+    @web.middleware
+    async def _guard(
+        self, request: web.Request, handler: Callable[[web.Request], Awaitable[web.StreamResponse]]
+    ) -> web.StreamResponse:
+        """Let only own pages in: by address, cookie and, for the stream, origin."""
+        if not self._is_own(request.host):
+            raise web.HTTPForbidden(text="lab: this address is not mine; open the one it printed\n")
+        token = request.query.get("token")
+        if request.path == "/" and token is not None:
+            if not secrets.compare_digest(token.encode(), self._token.encode()):
+                raise web.HTTPForbidden(text="lab: the token was used; open the last one printed\n")
+            self._invite()
+            answer = web.HTTPFound("/", headers=HEADERS)
+            name, strict = f"lab_{self._port}", "Strict"
+            answer.set_cookie(name, self._session, httponly=True, samesite=strict)
+            raise answer
+        cookie = request.cookies.get(f"lab_{self._port}", "")
+        if not secrets.compare_digest(cookie.encode(), self._session.encode()):
+            raise web.HTTPForbidden(text="lab: open the address that it printed, with its token\n")
+        if request.path == "/ws" and request.headers.get("Origin") != f"http://{request.host}":
+            raise web.HTTPForbidden(text="lab: another page may not connect\n")
+        return await handler(request)
+
+    # Pages ----------------------------------------------------------------------------------------
+
+    async def _page(self, request: web.Request) -> web.Response:
+        nonce = secrets.token_urlsafe(16)
+        text = templates.lab_page(nonce, self._laboratory.state["wheels"])
+        headers = {**HEADERS, "Content-Security-Policy": POLICY.format(nonce)}
+        return web.Response(text=text, content_type="text/html", headers=headers)
+
+    async def _result(self, request: web.Request) -> web.StreamResponse:
+        """Serve a report, or a file of gains."""
+        name, file = request.match_info["name"], request.match_info["file"]
+        state, folder = self._laboratory.state, self._laboratory.folder
+        if file == "report.html" and name == (state["identified"] or {}).get("name"):
+            path = folder / name / file
+        elif name == "gains" and file == (state["designed"] or {}).get("name"):
+            path = folder / file
+        else:
+            raise web.HTTPNotFound(text="lab: no such result\n")
+        return web.FileResponse(path, headers={**HEADERS, "Content-Security-Policy": REPORT_POLICY})
+
+    async def _talk(self, request: web.Request) -> web.WebSocketResponse:
+        socket = web.WebSocketResponse(max_msg_size=MAX_MESSAGE, compress=False)
+        await socket.prepare(request)
+        page = Page(socket)
+        self._pages.append(page)
+        if self._pages[1:] and self._laboratory.link.armed:
+            self._laboratory.link.halt("another page was opened")
+        self._driver = self._driver or page
+        for message in self._last.values():
+            page.put(message)
+        self._tell_roles()
+        writer = asyncio.ensure_future(page.write())
+        try:
+            async for message in socket:
+                if message.type is WSMsgType.TEXT:
+                    await self._take(page, message.data)
+        finally:
+            writer.cancel()
+            self._pages.remove(page)
+            if page is self._driver:
+                self._driver = None
+                if self._laboratory.link.armed:
+                    self._laboratory.link.halt("the page that drove was closed")
+            self._tell_roles()
+        return socket
+
+    def _tell_roles(self) -> None:
+        free, count = self._driver is None, len(self._pages)
+        for page in self._pages:
+            role = {"drives": page is self._driver, "free": free, "pages": count}
+            page.put(_encode("role", role))
+
+    async def _take(self, page: Page, text: str) -> None:
+        """Take a message of a page; a refused one is answered with the reason."""
+        page.heard_at = now = time.monotonic()
+        if page is self._driver:
+            self._laboratory.link.heard_at = now
+        try:
+            message = json.loads(text)
+            await self._do(page, message)
+        except SmpError as error:
+            page.put(_encode("refused", str(error)))
+        except (ValueError, TypeError, KeyError, AttributeError) as error:
+            page.put(_encode("refused", f"a malformed request: {error!r}"))
+
+    async def _do(self, page: Page, message: Any) -> None:
+        wanted = message["do"]
+        if wanted == "beat":
+            return
+        if wanted == "stop":  # which every page may
+            self._laboratory.link.halt("stop was pressed")
+            return
+        if wanted == "take":
+            driver = self._driver
+            if driver is not None and time.monotonic() - driver.heard_at < ABANDONED_S:
+                raise ParameterError("another page drives; close it first")
+            self._driver = page
+            self._laboratory.link.halt("another page took over")
+            self._tell_roles()
+            return
+        if page is not self._driver:
+            raise ParameterError("this page watches; another one drives")
+        if wanted == "design":
+            await self._design(page, message)
+        else:
+            self._laboratory.ask(message)
+
+    async def _design(self, page: Page, message: dict[str, Any]) -> None:
+        """Answer a move of the sliders with the design there."""
+        begun, wheel = time.monotonic(), str(message["wheel"])
+        if wheel not in self._laboratory.state["wheels"] or not self._laboratory.state["designed"]:
+            raise ParameterError(f"{wheel} has no design yet; design first")
+        by_hand = "p" in message
+        names = ("p", "i", "d") if by_hand else ("share", "phase_margin")
+        numbers = [float(message[name]) for name in names]
+        if not all(map(math.isfinite, numbers)):
+            raise ParameterError(f"{', '.join(names)} must be numbers")
+        work = lab_designs.judge if by_hand else lab_designs.choose
+        made = await asyncio.wrap_future(self._laboratory.designs.submit(work, wheel, *numbers))
+        self._laboratory.candidate(wheel, made)
+        took = round(1e3 * (time.monotonic() - begun))
+        page.put(_encode("design", {**made, "ms": took, "asked": message.get("asked")}))
+
+    def _send(self, kind: str, content: Any) -> None:
+        """Send to all pages, from any thread."""
+        self._loop.call_soon_threadsafe(self._spread, kind, content)
+
+    def _spread(self, kind: str, content: Any) -> None:
+        message = content if kind == "frame" else _encode(kind, content)
+        if isinstance(message, str):
+            self._last[kind] = message
+        for page in self._pages:
+            page.put(message)
+
+
+def _encode(kind: str, content: Any) -> str:
+    return str(msgspec.json.encode([kind, content], enc_hook=templates.encode_plain).decode())
+
+
+def _is_address(name: str) -> bool:
+    try:
+        ipaddress.ip_address(name)
+    except ValueError:
+        return False
+    return True
+
+
+def _is_loopback(host: str) -> bool:
+    return host == "localhost" or (_is_address(host) and ipaddress.ip_address(host).is_loopback)

@@ -1,0 +1,472 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Run ``lab``: do what its page asks of a robot, one thing after another.
+
+The main thread waits for the robot and works; the server of the page has a thread of its own.
+"""
+
+import argparse
+import itertools
+import math
+import os
+import queue
+import time
+from collections.abc import Callable, Mapping
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from smp_motor_control import WHEELS, controller_of
+from smp_motor_control.arrays import Array
+from smp_motor_control.errors import SmpError
+from smp_motor_control.excitation import SIGNALS
+from smp_motor_control.motor import Motor, MotorParameters
+from smp_motor_control.motor.file import PAPER_MOTORS, find_config
+from smp_motor_control.nodes import loopback
+from smp_motor_ident.cli import commissioning, demonstration, interruption, lab, lab_designs, steps
+from smp_motor_ident.cli.processes import Processes, connect, free_domain
+from smp_motor_ident.errors import ParameterError
+from smp_motor_ident.report import words
+from smp_motor_ident.report.document import read_identification
+from smp_motor_ident.result import UNITS, Quantity
+
+MAX_AMPLITUDE_SHARE = 1.0  # largest amplitude of an excitation [share of the supply]
+SHORTEST_S, LONGEST_S = 0.5, 300.0  # of an excitation
+TRIAL_S = 2.5  # for which gains on trial are watched
+STEP_AT_S, STEP_LASTS_S = 0.3, 1.2  # begin and length of the step of a trial
+QUIET_S = 4.0  # longest wait for other set-points to end
+STATE_S = 0.1  # shortest time between two messages about the state
+BACKGROUND = -10  # priority of what computes beside the robot
+MESSAGES = 6  # that a page shows
+COMBINATIONS = ("dc_gain", "time_constant", "time_constant_product", "static_voltage")
+
+
+def work(arguments: argparse.Namespace) -> int:
+    """Run the command and return its exit code."""
+    from smp_motor_ident.cli.lab_server import Server
+
+    folder = Path(arguments.output)
+    if folder.exists():
+        raise ParameterError(f"{folder}: exists already; choose another --output")
+    if arguments.demo:
+        domain = free_domain() if arguments.domain is None else arguments.domain
+        os.environ.update({"ROS_DOMAIN_ID": str(domain), **loopback.loopback_environment()})
+    ros = tuple(arguments.ros_arguments)
+    bounds = {"max_speed": arguments.max_speed, "max_current": arguments.max_current}
+    with (
+        connect(lab.NAME, ros) as client,
+        Processes(folder / "logs") as processes,
+        lab_designs.Designs() as designs,
+    ):
+        if arguments.demo:
+            robot = steps.Robot(processes, client, WHEELS, folder, ros, bounds)
+            motors = Path(arguments.motors) if arguments.motors else find_config(PAPER_MOTORS)
+            demonstration.start(robot, motors, arguments.rate)
+        else:
+            print("looking for the wheels that report, which takes some 5 s", flush=True)
+            wheels = tuple(arguments.wheel or ()) or commissioning.find_wheels(client)
+            robot = steps.Robot(processes, client, wheels or WHEELS, folder, ros, bounds)
+            client.wait_for_wheels(robot.wheels, timeout=15.0)
+            client.refuse_second_reporters(robot.wheels)
+        with Laboratory(robot, designs) as laboratory:
+            with Server(laboratory, arguments.host, arguments.port, not arguments.no_browser):
+                laboratory.run()
+    return 0
+
+
+class Halted(SmpError):
+    """The wheels were stopped while something moved them."""
+
+    exit_code = 1
+
+
+class Laboratory:
+    """One robot, what is being done with it, and what its pages show."""
+
+    def __init__(self, robot: steps.Robot, designs: lab_designs.Designs) -> None:
+        from smp_motor_control.nodes.live_link import COLUMNS, SLOT_S, LiveLink
+
+        self.robot, self.designs = robot, designs
+        self.folder = robot.folder.resolve()
+        self.send: Callable[[str, Any], None] = lambda kind, content: None  # to all pages
+        self.state: dict[str, Any] = {
+            "wheels": robot.wheels, "columns": COLUMNS, "slot": SLOT_S, "signals": [*SIGNALS],
+            "armed": False, "job": "", "progress": "", "messages": [], "supply": {},
+            "recordings": [], "learned": {}, "identified": {}, "designed": None, "trial": None,
+            "diagnostics": [], "drives": False,
+        }  # fmt: skip
+        self._slot_s, self._speed = SLOT_S, COLUMNS.index("speed")
+        self._prediction = COLUMNS.index("prediction")
+        self.link = LiveLink(robot.client, robot.wheels, self)
+        self._jobs: queue.SimpleQueue[tuple[str, Callable[[], None]]] = queue.SimpleQueue()
+        self._numbers = itertools.count(1)
+        self._models: dict[str, Prediction] = {}
+        self._excited: set[str] = set()
+        self._before: dict[str, dict[str, Any]] = {}  # parameters of wheels with gains on trial
+        self._candidates: dict[str, dict[str, Any]] = {}  # the design that a page shows, by wheel
+        self._told: tuple[float, str] = (0.0, "")
+        self._reason = ""
+        self._stack = ExitStack()
+        self._taken = False  # whether the controllers are this laboratory's
+
+    def __enter__(self) -> "Laboratory":
+        """Begin."""
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Stop the wheels, and give the controllers back."""
+        self.link.halt("lab ends")
+        self.robot.client.spin(2 * STATE_S)
+        self.robot.processes.stop("excite", "record", "identifier", "identify")
+        self._stack.close()
+
+    def run(self) -> None:
+        """Do what the pages ask until Ctrl-C."""
+        while True:
+            interruption.check()
+            self.robot.client.until(lambda: not self._jobs.empty(), 0.5)
+            if self._jobs.empty():
+                continue
+            name, work = self._jobs.get()
+            self.state["job"] = name
+            try:
+                work()
+            except SmpError as error:
+                self.tell(str(error), "error")
+            finally:
+                self.state["job"] = self.state["progress"] = ""
+                self.link.rest()
+
+    def tell(self, text: str, kind: str = "note") -> None:
+        """Show a message on all pages."""
+        shown = [*self.state["messages"], [next(self._numbers), kind, text]]
+        self.state["messages"] = shown[-MESSAGES:]
+
+    # Events of the link ------------------------------------------------------------------------
+
+    def on_frame(self, slots: Array, rows: Array) -> None:
+        """Send a batch of samples as rows of float32: slot, then the columns of every wheel."""
+        for wheel, model in list(self._models.items()):
+            k = self.robot.wheels.index(wheel)
+            rows[:, k, self._prediction] = model.follow(slots * self._slot_s, rows[:, k, 0])
+        table = np.column_stack([slots - self.link.history.origin, rows.reshape(slots.size, -1)])
+        self.send("frame", table.astype("<f4").tobytes())
+
+    def on_learned(self, wheel: str, message: Any) -> None:
+        """Show an estimate of the node identifier, and follow its model from now on."""
+        found = {
+            name: Quantity(value, std, unit=UNITS[name], status="estimated")
+            for name, value, std in zip(message.names, message.values, message.std_devs)
+            if name in UNITS
+        }
+        rows = [[words.label(name), words.state(one)] for name, one in found.items()]
+        fit = None if math.isnan(message.fit_percent) else round(message.fit_percent, 1)
+        self.state["learned"][wheel] = {"status": message.status, "fit": fit, "rows": rows}
+        hardware = self.link.hardware.get(wheel)
+        model = {n: float(found[n].value or 0.0) for n in COMBINATIONS if n in found}
+        if hardware is not None and {"dc_gain", "time_constant"} <= set(model):
+            _, rows_now = self.link.history.since(self.link.history.now - 20)
+            speeds = rows_now[:, self.robot.wheels.index(wheel), self._speed]
+            known = speeds[np.isfinite(speeds)]
+            speed = float(known[-1]) if known.size else 0.0
+            self._models[wheel] = Prediction(model, hardware.gear_ratio, speed)
+
+    def on_halt(self, reason: str) -> None:
+        """End an excitation at once, and verify that the controllers are inactive."""
+        self.robot.processes.interrupt("excite")
+        self._reason = reason
+        self.tell(f"Stopped: {reason}.", "stop")
+        if self._taken:
+            self._jobs.put(("stopping", lambda: self._activate(False)))
+
+    def on_tick(self) -> None:
+        """Send the state to the pages when it has changed."""
+        state, link, now = self.state, self.link, time.monotonic()
+        if now - self._told[0] < STATE_S:
+            return
+        state["armed"] = link.armed
+        state["drives"] = link.can_drive()
+        state["supply"] = {w: one.supply_voltage for w, one in link.hardware.items()}
+        space = str(self.robot.client.node.get_namespace()).strip("/")
+        state["diagnostics"] = sorted(
+            [name, level, text]
+            for name, (_, level, text) in link.diagnostics.items()
+            if name.startswith(space)
+        )
+        text = repr(state)
+        if text != self._told[1]:
+            self.send("state", state)
+        self._told = now, text
+
+    # What a page asks, in the thread of the server -----------------------------------------------
+
+    def ask(self, message: Mapping[str, Any]) -> None:
+        """Take a request of the page that drives."""
+        jobs: dict[str, tuple[str, Callable[[], None]]] = {
+            "arm": ("arming", self._arm),
+            "excite": ("exciting", lambda: self._excite(message)),
+            "discard": ("discarding recordings", self._discard),
+            "identify": ("identifying", self._identify),
+            "tune": ("designing", lambda: self._tune(bool(message.get("accept")))),
+            "apply": ("applying gains on trial", lambda: self._apply(str(message["wheel"]))),
+            "step": ("stepping", lambda: self._step(str(message["wheel"]))),
+            "keep": ("keeping gains", lambda: self._decide(keep=True)),
+            "back": ("taking gains back", lambda: self._decide(keep=False)),
+        }
+        wanted = str(message["do"])
+        if wanted == "drive":
+            self.link.drive(float(message["linear"]), float(message["angular"]))
+            return
+        if wanted not in jobs:
+            raise ParameterError(f"{wanted!r} is not known")
+        if wanted in ("excite", "apply", "step") and not self.link.armed:
+            raise ParameterError("arm first: nothing moves before")
+        if self.state["job"]:
+            raise ParameterError(f"busy with {self.state['job']}; wait, or stop it")
+        self._jobs.put(jobs[wanted])
+
+    def candidate(self, wheel: str, made: dict[str, Any]) -> None:
+        """Note the design that the driving page shows for a wheel."""
+        self._candidates[wheel] = made
+
+    # Jobs, in the main thread -------------------------------------------------------------------
+
+    def _wait(self, done: Callable[[], bool], moving: bool = False, name: str = "") -> None:
+        """Wait while the streams go on; raise if what moves the wheels was stopped."""
+        while not done():
+            interruption.check()
+            if moving and not self.link.armed:
+                raise Halted(f"ended before its end: {self._reason}")
+            if name:
+                self.state["progress"] = self.robot.processes.last_line(name)
+            self.robot.client.until(done, 0.1)
+
+    def _arm(self) -> None:
+        client, link = self.robot.client, self.link
+        if not self._taken:
+            if missing := self.robot.uncontrolled():
+                self.tell(f"No wheel_pid runs for {', '.join(missing)}: one is started.")
+                self.robot.start_controllers(missing)
+            self._stack.enter_context(client.paused(self.robot.wheels))
+            controllers = [controller_of(wheel) for wheel in self.robot.wheels]
+            client.set_pending_restore(**client.pending_restore, halt=controllers)
+            self._taken = True
+        link.heard_at, link.armed = time.monotonic(), True
+        self._activate(True)
+
+    def _activate(self, active: bool) -> None:
+        self.link.controlled = self.link.controlled or active
+        self.robot.switch("activate" if active else "deactivate")
+        self.link.controlled = active
+
+    def _excite(self, asked: Mapping[str, Any]) -> None:
+        wheels = [w for w in self.robot.wheels if w in asked["wheels"]]
+        amplitude, duration = float(asked["amplitude"]), float(asked["seconds"])
+        supply = min(self.state["supply"].values(), default=12.0)
+        if not wheels:
+            raise ParameterError("no wheel is chosen; choose one")
+        if not 0.0 < amplitude <= MAX_AMPLITUDE_SHARE * supply:
+            raise ParameterError(f"the amplitude is {amplitude:g} V; the supply is {supply:g} V")
+        if not SHORTEST_S <= duration <= LONGEST_S:
+            raise ParameterError(
+                f"the excitation takes {duration:g} s; allowed are {SHORTEST_S:g} to {LONGEST_S:g}"
+            )
+        self._activate(False)
+        processes, ros = self.robot.processes, self.robot.ros_arguments
+        processes.stop("identifier")
+        self._models.clear()
+        self.state["learned"] = {}
+        listed = f"wheels:=[{', '.join(wheels)}]"
+        window = min(max(duration, 5.0), 60.0)
+        processes.start(
+            "identifier", "identifier", *ros, "--ros-args", "-p", listed, "-p", "period:=1.0",
+            "-p", "share:=0.2", "-p", f"window:={window}", priority=BACKGROUND,
+        )  # fmt: skip
+        name = f"recording_{next(self._numbers)}"
+        try:
+            steps.record(self.robot, name)
+            parameters = {
+                "signal": asked["signal"], "wheels": f"[{', '.join(wheels)}]",
+                "wheel_names": f"[{', '.join(self.robot.wheels)}]", "amplitude": amplitude,
+                "duration": duration, **self.robot.bounds,
+            }  # fmt: skip
+            given = [a for n, v in parameters.items() for a in ("-p", f"{n}:={v}")]
+            if not self.link.armed:
+                raise Halted(f"nothing moved: {self._reason}")
+            processes.start("excite", "excite", *ros, "--ros-args", *given)
+            begun = time.monotonic()
+
+            def ended() -> bool:
+                since = time.monotonic() - begun
+                self.state["progress"] = f"{min(since, duration):.0f} of {duration:g} s"
+                return bool(processes.has_ended("excite"))
+
+            self._wait(ended, moving=True)
+            processes.wait("excite", steps.TIMEOUT_S)
+        finally:
+            processes.stop("excite", "record")
+        self.state["recordings"] = [*self.state["recordings"], name]
+        self._excited.update(wheels)
+        self._activate(True)
+        self.tell(f"Recorded {name}: {asked['signal']}, {amplitude:g} V, {duration:g} s.")
+
+    def _discard(self) -> None:
+        self.state["recordings"] = []
+        self._excited.clear()
+
+    def _identify(self) -> None:
+        bags = [str(self.folder / name) for name in self.state["recordings"]]
+        if not bags:
+            raise ParameterError("there is no recording; excite the wheels first")
+        self.robot.processes.stop("identifier")
+        output = self.folder / f"identification_{next(self._numbers)}"
+        wheels = [a for wheel in sorted(self._excited) for a in ("--wheel", wheel)]
+        given = [*bags, "--output", str(output), *wheels]
+        self.robot.processes.start("identify", "identify", *given, priority=BACKGROUND)
+        self._wait(lambda: self.robot.processes.has_ended("identify"), name="identify")
+        last = self.robot.processes.last_line("identify")
+        self.robot.processes.stop("identify")
+        if not (output / "identification.json").is_file():
+            raise ParameterError(last)
+        self.state["identified"] = {
+            "name": output.name,
+            "wheels": {w: _shown(one) for w, one in read_identification(output).items()},
+        }
+        self.state["designed"] = None
+        self.tell(f"Identified {', '.join(self.state['identified']['wheels'])}.")
+
+    def _tune(self, accept: bool) -> None:
+        if not self.state["identified"]:
+            raise ParameterError("no motor is identified yet; identify the motors first")
+        name = self.state["identified"]["name"]
+        gains = self.folder / f"gains_{next(self._numbers)}.yaml"
+        asked = self.designs.submit(lab_designs.design, self.folder / name, gains, accept)
+        self._wait(asked.done)
+        found = asked.result()
+        self._candidates = dict(found["designs"])
+        self.send("designs", found)
+        self.state["designed"] = {"name": gains.name, "reason": found["reason"]}
+        self.tell(f"Designed gains for {', '.join(found['designs'])}: {gains.name}.")
+
+    def _apply(self, wheel: str) -> None:
+        """Set the gains that the page shows, and restore the old ones if the wheel misbehaves."""
+        from smp_motor_control.nodes.gain_trial import try_gains
+
+        made = self._candidates.get(wheel, {})
+        if "parameters" not in made:
+            raise ParameterError(f"{wheel or 'no wheel'} has no design to apply; design one first")
+        client, new = self.robot.client, dict(made["parameters"])
+        node = controller_of(wheel)
+        old = client.get_parameters({node: list(new)})[node]
+        self._wait_for_quiet()
+        self._activate(True)
+        self.link.follow({wheel: [(0.0, 0.0)]})
+        outcome = try_gains(
+            client, {wheel: {n: v for n, v in new.items() if n in old}}, TRIAL_S,
+            self.state["supply"].get(wheel, 12.0), self.tell, lambda: self._begin_step(wheel),
+        )  # fmt: skip
+        if outcome.reason:
+            raise Halted(f"{outcome.reason}; its old gains are restored")
+        self._before.setdefault(wheel, old)
+        self._note_trials()
+        self.state["trial"] = {"wheel": wheel, "wheels": sorted(self._before)}
+        self._show_step(wheel)
+
+    def _step(self, wheel: str) -> None:
+        if wheel not in self._candidates:
+            raise ParameterError(f"{wheel or 'no wheel'} has no design; its step would be unknown")
+        self._wait_for_quiet()
+        self._activate(True)
+        self._begin_step(wheel)
+        end = time.monotonic() + STEP_AT_S + STEP_LASTS_S
+        self._wait(lambda: time.monotonic() > end, moving=True)
+        self._show_step(wheel)
+
+    def _begin_step(self, wheel: str) -> None:
+        self._stepped_at = self.link.history.now
+        change = float(self._candidates[wheel]["change"])
+        plan = [(0.0, 0.0), (STEP_AT_S, change), (STEP_AT_S + STEP_LASTS_S, 0.0)]
+        self.link.follow({wheel: plan})
+
+    def _show_step(self, wheel: str) -> None:
+        """Send the measured answer to the step, from the instant of its set-point [s]."""
+        slots, rows = self.link.history.since(self._stepped_at)
+        mine = rows[:, self.robot.wheels.index(wheel)]
+        change = float(self._candidates[wheel]["change"])
+        asked = np.flatnonzero(np.abs(mine[:, 3] - change) < 1e-6 * abs(change))
+        if asked.size == 0:
+            raise Halted(f"{wheel} reported no set-point of {change:.3g} rad/s")
+        shown = slice(asked[0], asked[-1] + 1)
+        time_s = (slots[shown] - slots[asked[0]]) * self._slot_s
+        known = np.isfinite(mine[shown, self._speed])
+        speed = mine[shown, self._speed][known]
+        self.send("step", {"wheel": wheel, "time": time_s[known].tolist(), "speed": speed.tolist()})
+
+    def _wait_for_quiet(self) -> None:
+        """Wait until the set-points of a drive have ended."""
+        from smp_motor_control.nodes.driving import refuse_rivals
+
+        self.link.rest()
+        end = time.monotonic() + QUIET_S
+        while True:
+            try:
+                refuse_rivals(self.robot.client)
+                return
+            except SmpError:
+                if time.monotonic() > end:
+                    raise
+
+    def _decide(self, keep: bool) -> None:
+        if not self._before:
+            raise ParameterError("no gains are on trial")
+        if not keep:
+            self.robot.client.set_parameters(
+                {controller_of(wheel): old for wheel, old in self._before.items()}
+            )
+        done = ", ".join(sorted(self._before))
+        self.tell(f"{done}: {'gains kept' if keep else 'old gains restored'}.")
+        self._before.clear()
+        self.state["trial"] = None
+        self._note_trials()
+
+    def _note_trials(self) -> None:
+        """Let the guard restore the old gains if this process dies."""
+        pending = {n: v for n, v in self.robot.client.pending_restore.items() if n != "gains"}
+        if self._before:
+            pending["gains"] = {controller_of(w): old for w, old in self._before.items()}
+        self.robot.client.set_pending_restore(**pending)
+
+
+class Prediction:
+    """Speed of an estimated motor under the recorded voltage."""
+
+    def __init__(self, model: Mapping[str, float], gear_ratio: float, speed: float) -> None:
+        self._ratio = gear_ratio
+        self._motor = Motor(MotorParameters.from_combinations(**model), speed=speed * gear_ratio)
+        self._time = math.nan
+
+    def follow(self, time: Array, voltage: Array) -> list[float]:
+        """Return the wheel's speed [rad/s] at instants [s] that end intervals of a voltage [V]."""
+        speeds = []
+        for now, volts in zip(time.tolist(), voltage.tolist()):
+            if math.isfinite(volts):
+                step = min(now - self._time, 1.0) if math.isfinite(self._time) else 0.0
+                self._motor.step(volts, max(step, 0.0))
+                self._time = now
+            speeds.append(self._motor.speed / self._ratio)
+        return speeds
+
+
+def _shown(estimate: Any) -> dict[str, Any]:
+    """Return what a page shows of an identified motor."""
+    held = {**estimate.combinations, **estimate.parameters}
+    grave = [one for one in estimate.findings if one.severity != "note"]
+    return {
+        "rows": [
+            [words.label(n), words.state(q), words.systematic(q)] for n, q in held.items()
+        ],
+        "fit": estimate.fit_percent.validation or estimate.fit_percent.estimation,
+        "findings": [[one.severity, f"{words.to_sentence(one.message)} {one.advice}"] for one in grave[:3]],
+        "unreliable": any(one.severity in ("unreliable", "refused") for one in grave),
+    }

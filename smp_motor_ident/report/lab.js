@@ -1,0 +1,328 @@
+// The page of lab: draws what the server streams, and asks it for what the buttons say.
+"use strict";
+(() => {
+  const {color, unpack, written, options} = smpCharts;
+  const part = id => document.getElementById(id);
+  const make = (tag, text = "", kind = "") => Object.assign(document.createElement(tag), {textContent: text, className: kind});
+  const row = (...cells) => { const one = make("tr"); one.append(...cells.map(cell => cell instanceof Node ? cell : make("td", cell))); return one; };
+  const label = wheel => { const text = wheel.replaceAll("_", " "); return text[0].toUpperCase() + text.slice(1); };
+  const KEPT = 60, PLOT = {speed: 200, voltage: 160};
+  let state = {wheels: [], columns: [], slot: 0.005, messages: [], supply: {}, diagnostics: [], recordings: [], learned: {}, identified: {}};
+  let role = {drives: false, free: false, pages: 1};
+  let designs = {}, pending = null, waiting = false, counter = 0;
+
+  // The connection, which a worker keeps: drawing does not delay its beats, a page that hangs ends them --
+
+  function keepConnection(address, frozen) {
+    let socket, heard = 0;
+    const open = () => {
+      socket = new WebSocket(address);
+      socket.binaryType = "arraybuffer";
+      socket.onmessage = ({data}) => postMessage(data, typeof data === "string" ? [] : [data]);
+      socket.onclose = () => { postMessage(null); setTimeout(open, 1000); };
+    };
+    const send = text => { if (socket.readyState === WebSocket.OPEN) socket.send(text); };
+    onmessage = ({data}) => { heard = performance.now(); if (data) send(data); };
+    setInterval(() => { if (performance.now() - heard < frozen) send('{"do":"beat"}'); }, 80);
+    open();
+  }
+  const code = `(${keepConnection})("ws://${location.host}/ws", 1000)`;
+  const worker = new Worker(URL.createObjectURL(new Blob([code], {type: "text/javascript"})));
+  const ask = (what, more = {}) => worker.postMessage(JSON.stringify({do: what, ...more}));
+  worker.onmessage = ({data}) => {
+    if (data === null) {
+      part("role").textContent = "not connected: the wheels are stopped";
+      document.body.classList.add("watching");
+    } else if (typeof data === "string") {
+      const [kind, content] = JSON.parse(data);
+      ({state: show, role: showRole, designs: showDesigns, design: showDesign, step: showStep, refused: showRefusal})[kind](content);
+    } else take(new Float32Array(data));
+  };
+  setInterval(() => worker.postMessage(""), 100);
+  document.addEventListener("visibilitychange", () => { if (document.hidden && state.armed && role.drives) ask("stop"); });
+
+  // Samples: one row for each slot of time, the columns of every wheel --------------------------------
+
+  const times = [], values = [];  // values: one array for each wheel and column
+  let paused = false, zoomed = null, dirty = false, drawn = 0, cost = 0, told = 0;
+
+  function take(table) {
+    const width = 1 + state.wheels.length * state.columns.length;
+    if (width < 2) return;
+    while (values.length < width - 1) values.push([]);
+    if (table[0] * state.slot < times.at(-1)) { times.length = 0; values.forEach(one => { one.length = 0; }); }
+    for (let at = 0; at < table.length; at += width) {
+      times.push(table[at] * state.slot);
+      for (let k = 1; k < width; k++) values[k - 1].push(Number.isNaN(table[at + k]) ? null : table[at + k]);
+    }
+    const old = times.findIndex(t => t > times.at(-1) - KEPT);
+    if (old > 1000) { times.splice(0, old); values.forEach(one => one.splice(0, old)); }
+    if (dirty) return;
+    dirty = true;  // drawing takes at most a third of the time
+    setTimeout(() => requestAnimationFrame(draw), Math.max(0, drawn + 3 * cost - performance.now()));
+  }
+  const column = (wheel, name) => values[state.wheels.indexOf(wheel) * state.columns.length + state.columns.indexOf(name)] || [];
+  const newest = list => { for (let k = list.length - 1; k >= Math.max(0, list.length - 40); k--) if (list[k] != null) return list[k]; return null; };
+  const from = time => { let low = 0, high = times.length; while (low < high) { const middle = (low + high) >> 1; if (times[middle] < time) low = middle + 1; else high = middle; } return low; };
+
+  const SHOWN = {
+    speed: [["set-point", "setpoint", "muted", 1, [5, 3]], ["reference", "reference", "voltage", 1], ["speed", "speed", "measured", 1.5], ["predicted", "prediction", "simulated", 1.5]],
+    voltage: [["voltage [V]", "voltage", "voltage", 1.5], ["current [A]", "current", "simulated", 1]],
+  };
+  const plots = [];
+  const nice = size => { const unit = 10 ** Math.floor(Math.log10(size)); return [1, 2, 5, 10].find(k => k * unit >= size) * unit; };
+
+  function plot(place, wheel, kind) {
+    const axis = {stroke: () => color("muted"), grid: {stroke: () => color("grid"), width: 1}, ticks: {show: false}};
+    const value = (u, v) => written(v);
+    const series = SHOWN[kind].map(([name, , shade, width, dash]) => ({label: name, stroke: () => color(shade), width, dash, spanGaps: true, points: {show: false}, value, scale: name.endsWith("[A]") ? "A" : "y"}));
+    const limit = () => (kind === "voltage" ? state.supply[wheel] : 0) || 0;
+    const ends = u => { const most = kind === "voltage" && limit() ? 1.08 * limit() : Math.max(1, u.most || 0); return [-most, most]; };
+    const lines = u => {
+      if (!limit()) return;
+      u.ctx.save(); u.ctx.strokeStyle = color("bad"); u.ctx.setLineDash([4, 4]);
+      for (const level of [limit(), -limit()]) { const y = u.valToPos(level, "y", true); u.ctx.beginPath(); u.ctx.moveTo(u.bbox.left, y); u.ctx.lineTo(u.bbox.left + u.bbox.width, y); u.ctx.stroke(); }
+      u.ctx.restore();
+    };
+    const axes = [{...axis, size: 28, values: (u, marks) => marks.map(v => `${written(v)} s`)}, {...axis, size: 50, label: kind === "speed" ? "rad/s" : "V", labelSize: 18}];
+    if (kind === "voltage") axes.push({...axis, scale: "A", side: 1, size: 46, label: "A", labelSize: 18, grid: {show: false}});
+    const u = new uPlot({
+      width: place.clientWidth || 360, height: PLOT[kind], axes, series: [{label: "time [s]", value}, ...series],
+      scales: {x: {time: false}, y: {range: ends}, A: {range: () => { const most = Math.max(0.1, u.amps || 0); return [-most, most]; }}},
+      cursor: {sync: {key: "watch"}, drag: {setScale: false}, bind: {dblclick: () => () => { pause(false); }}},
+      hooks: {draw: [lines], setSelect: [() => { if (u.select.width > 4) { zoomed = [u.posToVal(u.select.left, "x"), u.posToVal(u.select.left + u.select.width, "x")]; pause(true); u.setSelect({left: 0, width: 0}, false); } }]},
+    }, [[], ...series.map(() => [])], place);
+    u.wheel = wheel; u.kind = kind;
+    plots.push(u);
+    new ResizeObserver(() => { if (place.clientWidth && place.clientWidth !== u.width) u.setSize({width: place.clientWidth, height: PLOT[kind]}); }).observe(place);
+  }
+  for (const place of document.querySelectorAll(".wheel .plot")) plot(place, place.closest(".wheel").id, place.dataset.kind);
+
+  const range = () => zoomed || [times.at(-1) - Number(part("window").value), times.at(-1)];
+  function draw() {
+    dirty = false;
+    frames += 1;
+    drawn = performance.now();
+    if (drawn - told > 100) { told = drawn; tell(); settle(); }
+    if (!paused) redraw();
+    cost = performance.now() - drawn;
+  }
+  function tell() {
+    for (const wheel of state.wheels) {
+      const panel = part(wheel), now = name => newest(column(wheel, name)), text = (v, unit, digits) => v == null ? "–" : `${v.toFixed(digits)} ${unit}`;
+      const target = now("setpoint"), speed = now("speed");
+      for (const [name, value, unit] of [["speed", speed, "rad/s"], ["setpoint", target, "rad/s"], ["error", target == null || speed == null ? null : target - speed, "rad/s"], ["voltage", now("voltage"), "V"], ["current", now("current"), "A"]])
+        panel.querySelector(`.${name}`).textContent = text(value, unit, 2);
+    }
+  }
+  function redraw() {
+    if (!times.length) return;
+    const [begin, end] = range(), first = Math.max(0, from(begin) - 1), last = Math.min(times.length, from(end) + 1), x = times.slice(first, last);
+    for (const u of plots) {
+      const data = SHOWN[u.kind].map(([, name]) => column(u.wheel, name).slice(first, last));
+      const size = list => list.reduce((most, v) => v == null ? most : Math.max(most, Math.abs(v)), 0);
+      if (u.kind === "speed") u.most = nice(1.05 * Math.max(0.5, ...data.map(size)));
+      else u.amps = nice(1.05 * Math.max(0.05, size(data[1])));
+      u.batch(() => { u.setData([x, ...data], false); u.setScale("x", {min: begin, max: end}); });
+    }
+  }
+  let frames = 0;
+  setInterval(() => { document.body.dataset.frames = frames; frames = 0; }, 1000);
+  function pause(yes) { paused = yes; if (!yes) zoomed = null; part("pause").setAttribute("aria-pressed", yes); redraw(); }
+  part("pause").addEventListener("click", () => pause(!paused));
+  part("window").addEventListener("change", () => { if (!paused) redraw(); });
+  part("save").addEventListener("click", () => {
+    const [begin, end] = range(), names = state.wheels.flatMap(wheel => state.columns.map(name => `${wheel}_${name}`));
+    const lines = [["time", ...names].join(",")];
+    for (let k = from(begin); k < times.length && times[k] <= end; k++) lines.push([times[k].toFixed(4), ...values.map(one => one[k] ?? "")].join(","));
+    const link = make("a");
+    link.href = URL.createObjectURL(new Blob([lines.join("\n") + "\n"], {type: "text/csv"}));
+    link.download = "lab.csv";
+    link.click();
+    setTimeout(() => URL.revokeObjectURL(link.href), 1000);
+  });
+
+  // State and roles ---------------------------------------------------------------------------------
+
+  function show(content) {
+    const before = state;
+    state = content;
+    part("arm").setAttribute("aria-pressed", state.armed);
+    part("arm").textContent = state.armed ? "Armed" : "Arm";
+    const doing = state.job ? `${state.job[0].toUpperCase()}${state.job.slice(1)}${state.progress ? `: ${state.progress}` : ""} …` : "";
+    part("job").textContent = doing || (state.armed ? "Armed: the wheels may turn." : "Nothing moves before Arm. Put the robot on blocks first.");
+    if (changed(before.messages, state.messages)) list("messages", state.messages.slice(-2).map(([, kind, text]) => [{error: "refused", stop: "warning"}[kind] || "", text]));
+    list("diagnostics", state.diagnostics.map(([name, level, text]) => ["", `${name}: ${["", "warning: ", "error: ", "stale: "][level]}${text}`]));
+    for (const wheel of state.wheels) {
+      const [, level, text] = state.diagnostics.find(([name]) => name.endsWith(`${wheel}/wheel_pid`)) || ["", 0, "no wheel_pid"];
+      Object.assign(part(wheel).querySelector(".health"), {textContent: text, className: `small health ${["", "warn", "bad", "bad"][level]}`});
+    }
+    if (changed(before.signals, state.signals)) part("signal").replaceChildren(...state.signals.map(name => make("option", name)));
+    if (changed(before.signals, state.signals) && state.signals.includes("fourier")) part("signal").value = "fourier";
+    part("recordings").textContent = state.recordings.length ? `Recorded: ${state.recordings.join(", ")}.` : "No recording.";
+    if (changed(before.learned, state.learned)) part("learned").replaceChildren(...Object.entries(state.learned).map(([wheel, one]) => row(label(wheel), one.rows.map(([name, value]) => `${name} ${value}`).join("; ") || "–", one.fit == null ? one.status : `${one.status}, fit ${one.fit} %`)));
+    if (changed(before.identified, state.identified)) showIdentified(state.identified.wheels || {}, state.identified.name);
+    const made = state.designed;
+    part("designed").textContent = made ? `${made.name}: ${made.reason}.` : "No design.";
+    part("gains").hidden = !made;
+    if (made) { part("gains").href = `/results/gains/${made.name}`; part("gains").download = made.name; }
+    part("trial").textContent = state.trial ? `On trial: ${state.trial.wheels.map(label).join(", ")}. Keep the gains, or take them back.` : "";
+    part("cannot").textContent = state.drives ? "Drag, or hold the arrow keys; the wheels stop on release." : "No node takes cmd_vel: start skid_steer to drive.";
+    enable();
+  }
+  const changed = (before, now) => JSON.stringify(before) !== JSON.stringify(now);
+  const list = (id, lines) => part(id).replaceChildren(...lines.map(([kind, text]) => make("li", text, kind)));
+  function showIdentified(wheels, name) {
+    part("identified").replaceChildren(...Object.entries(wheels).flatMap(([wheel, one]) => one.rows.map(([quantity, value, systematic], k) => row(k ? "" : `${label(wheel)}${one.fit == null ? "" : `, fit ${one.fit.toFixed(1)} %`}`, quantity, value, systematic))));
+    list("findings", Object.entries(wheels).flatMap(([wheel, one]) => one.findings.map(([severity, text]) => [severity, `${label(wheel)}: ${text}`])));
+    part("report").querySelector("iframe")?.remove();
+    part("report").open = false;
+    part("report").dataset.source = name ? `/results/${name}/report.html` : "";
+  }
+  part("report").addEventListener("toggle", () => {
+    const source = part("report").dataset.source;
+    if (!part("report").open || !source || part("report").querySelector("iframe")) return;
+    part("report").append(Object.assign(document.createElement("iframe"), {src: source, title: "Report of the identification"}));
+  });
+  function showRole(content) {
+    role = content;
+    part("role").textContent = role.drives ? (role.pages > 1 ? `drives; ${role.pages - 1} watching` : "drives") : "watches";
+    part("take").hidden = role.drives;
+    document.body.classList.toggle("watching", !role.drives);
+    enable();
+  }
+  function enable() {
+    const may = {excite: state.armed, apply: state.armed && designs[part("wheel").value]?.parameters, step: state.armed && designs[part("wheel").value], identify: state.recordings.length, discard: state.recordings.length, tune: state.identified.name, keep: state.trial, back: state.trial, arm: !state.armed};
+    for (const [id, possible] of Object.entries(may)) part(id).disabled = !role.drives || Boolean(state.job) || !possible;
+    for (const one of document.querySelectorAll("fieldset")) one.disabled = !role.drives;
+    for (const id of ["share", "phase_margin", "p", "i", "d"]) part(id).disabled = !role.drives || !Object.keys(designs).length;
+  }
+  function showRefusal(text) { list("messages", [["refused", text]]); waiting = false; }
+
+  for (const what of ["arm", "stop", "take", "discard", "identify", "keep", "back"]) part(what).addEventListener("click", () => ask(what));
+  part("excite").addEventListener("click", () => ask("excite", {wheels: [...document.querySelectorAll(".excited:checked")].map(one => one.value), signal: part("signal").value, amplitude: part("amplitude").valueAsNumber, seconds: part("seconds").valueAsNumber}));
+  part("tune").addEventListener("click", () => ask("tune", {accept: part("accept").checked}));
+  for (const what of ["apply", "step"]) part(what).addEventListener("click", () => ask(what, {wheel: part("wheel").value}));
+
+  // Tuning --------------------------------------------------------------------------------------------
+
+  const figures = {};
+  let measured = {};
+  function showDesigns(content) {
+    designs = content.designs;
+    measured = {};
+    part("tune-charts").replaceChildren();
+    for (const chart of content.charts) {
+      if (chart.name === "tuning-step") chart.curves.push({name: "measured", color: "simulated", kind: "line", width: 1.5, low: null, high: null, y: null});
+      const figure = make("figure", "", "chart"), place = make("div", "", "live");
+      Object.assign(place, {role: "img", ariaLabel: chart.title});
+      figure.append(make("h3", chart.title), place);
+      part("tune-charts").append(figure);
+      figures[chart.name] = new uPlot(options(chart, place.clientWidth || 480), [[0, 1]], place);
+      new ResizeObserver(() => { if (place.clientWidth) figures[chart.name].setSize({width: place.clientWidth, height: chart.height}); }).observe(place);
+    }
+    part("share").value = 1; part("phase_margin").value = 60;
+    showDesign({...designs[part("wheel").value], ms: null});
+  }
+  function showDesign(made) {
+    waiting = false;
+    if (made.wheel && made.asked != null) designs[made.wheel] = made;
+    if (pending) { const next = pending; pending = null; request(next); }
+    if (made.wheel !== part("wheel").value) return;
+    part("reason").textContent = made.reason || "";
+    part("rows").replaceChildren(...(made.rows || []).map(([name, value, band]) => row(make("td", name), make("td", value, "num strong"), make("td", band, "num"))));
+    part("yaml").textContent = made.yaml || "";
+    part("yaml").dataset.ms = made.ms ?? "";
+    if (made.gains) for (const [k, name] of ["p", "i", "d"].entries()) if (document.activeElement !== part(name)) part(name).value = Number(made.gains[k].toPrecision(4));
+    part("share-shown").textContent = made.crossover ? `${written(made.crossover)} rad/s` : "";
+    part("margin-shown").textContent = made.phase_margin ? `${made.phase_margin.toFixed(0)}°` : "";
+    for (const [name, arrays] of Object.entries(made.charts || {})) {
+      const data = arrays.map(unpack);
+      if (name === "tuning-step") data.push(data[0].map(t => at(measured[made.wheel], t / 1000)));
+      figures[name].setData(data);
+    }
+    enable();
+  }
+  function at(step, time) {
+    if (!step || time > step.time.at(-1)) return null;
+    const k = step.time.findIndex(t => t >= time);
+    if (k < 1) return step.speed[0];
+    const share = (time - step.time[k - 1]) / (step.time[k] - step.time[k - 1]);
+    return step.speed[k - 1] + share * (step.speed[k] - step.speed[k - 1]);
+  }
+  function showStep(step) {
+    measured[step.wheel] = step;
+    if (designs[step.wheel]) showDesign({...designs[step.wheel]});
+  }
+  function request(values) {
+    if (waiting) { pending = values; return; }
+    waiting = true;
+    counter += 1;
+    ask("design", {wheel: part("wheel").value, asked: counter, ...values});
+  }
+  for (const id of ["share", "phase_margin"]) part(id).addEventListener("input", () => request({share: Number(part("share").value), phase_margin: Number(part("phase_margin").value)}));
+  for (const id of ["p", "i", "d"]) part(id).addEventListener("input", () => request(Object.fromEntries(["p", "i", "d"].map(name => [name, part(name).valueAsNumber]))));
+  part("wheel").addEventListener("change", () => { if (designs[part("wheel").value]) showDesign({...designs[part("wheel").value]}); });
+
+  // Driving -------------------------------------------------------------------------------------------
+
+  const pad = part("pad"), held = new Set();
+  let stick = [0, 0], wasDriving = false;  // right and ahead, -1 to 1
+  function move(right, ahead) {
+    const size = Math.max(1, Math.hypot(right, ahead));
+    stick = [right / size, ahead / size];
+    part("knob").style.transform = `translate(${92 * stick[0]}px, ${-92 * stick[1]}px)`;
+  }
+  const point = event => { const box = pad.getBoundingClientRect(); move((event.clientX - box.left - box.width / 2) / 92, -(event.clientY - box.top - box.height / 2) / 92); };
+  pad.addEventListener("pointerdown", event => { pad.setPointerCapture(event.pointerId); pad.focus(); point(event); event.preventDefault(); });
+  pad.addEventListener("pointermove", event => { if (pad.hasPointerCapture(event.pointerId)) point(event); });
+  for (const end of ["pointerup", "pointercancel", "lostpointercapture"]) pad.addEventListener(end, () => move(0, 0));
+  const KEYS = {ArrowUp: [0, 1], ArrowDown: [0, -1], ArrowLeft: [-1, 0], ArrowRight: [1, 0], w: [0, 1], s: [0, -1], a: [-1, 0], d: [1, 0]};
+  const follow = () => move(...[...held].map(key => KEYS[key]).reduce(([x, y], [a, b]) => [x + a, y + b], [0, 0]));
+  addEventListener("keydown", event => {
+    if (event.key === " " && state.armed) { ask("stop"); event.preventDefault(); event.stopPropagation(); return; }
+    const key = event.key.length === 1 ? event.key.toLowerCase() : event.key;
+    if (!KEYS[key] || document.activeElement !== pad) return;
+    held.add(key); follow(); event.preventDefault();
+  }, true);
+  addEventListener("keyup", event => { if (held.delete(event.key.length === 1 ? event.key.toLowerCase() : event.key)) follow(); });
+  for (const source of [pad, window]) source.addEventListener("blur", () => { held.clear(); move(0, 0); });
+  setInterval(() => {
+    for (const [id, unit] of [["linear", "m/s"], ["angular", "rad/s"]]) part(`${id}-shown`).textContent = `${Number(part(id).value).toFixed(2)} ${unit}`;
+    const driving = role.drives && state.armed && (stick[0] !== 0 || stick[1] !== 0);
+    const linear = driving ? stick[1] * Number(part("linear").value) : 0, angular = driving ? -stick[0] * Number(part("angular").value) : 0;
+    if (driving || wasDriving) ask("drive", {linear, angular});
+    wasDriving = driving;
+    part("commanded").textContent = `${linear.toFixed(2)} m/s, ${angular.toFixed(2)} rad/s`;
+  }, 50);
+
+  // Since the set-point of a wheel changed, until its speed stays within 5 % of the change.
+  const REST = 0.6, LEAST = 0.3, SMOOTH = 5;
+  let judged = 0;
+  function settle() {
+    const end = times.at(-1), rests = state.wheels.map(wheel => newest(column(wheel, "setpoint")));
+    if (rests.some(v => v == null) || end - judged < 0.2) return;
+    judged = end;
+    const found = state.wheels.map((wheel, w) => {
+      const asked = column(wheel, "setpoint"), speed = column(wheel, "speed");
+      let last = times.length - 1;
+      while (last > 0 && (asked[last] == null || Math.abs(asked[last] - rests[w]) < 1e-3)) last--;
+      if (last < 1 || end - times[last] < REST || end - times[last] > 3 * REST) return null;
+      let first = last;  // the change may be a ramp
+      while (first > 0 && times[last] - times[first] < 2 && (asked[first - 1] == null || Math.abs(asked[first - 1] - (asked[first] ?? asked[first - 1])) > 1e-6 || asked[first] == null)) first--;
+      const change = Math.abs(rests[w] - (asked[first] ?? rests[w]));
+      if (change < LEAST) return null;
+      let out = first;
+      for (let k = first; k < times.length - SMOOTH; k++) {
+        const some = speed.slice(k, k + SMOOTH).filter(v => v != null), mean = some.reduce((a, b) => a + b, 0) / some.length;
+        if (some.length && Math.abs(mean - rests[w]) > 0.05 * change) out = k + SMOOTH;
+      }
+      return [wheel, 1000 * (times[Math.min(out, times.length - 1)] - times[first])];
+    }).filter(Boolean);
+    if (found.length !== state.wheels.length) return;
+    const all = found.map(([, ms]) => ms);
+    part("settled").replaceChildren(...found.map(([wheel, ms]) => row(label(wheel), `${ms.toFixed(0)} ms`)), row("Spread", `${(Math.max(...all) - Math.min(...all)).toFixed(0)} ms`));
+  }
+
+  matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => [...plots, ...Object.values(figures)].forEach(u => u.redraw(false, true)));
+})();
