@@ -56,6 +56,7 @@ def main() -> int:
         for line in sys.stdin:
             if line.endswith("\n"):
                 pending_restore = json.loads(line)
+                client.prepare(pending_restore)
         end = time.monotonic() + RETRY_TIME_S
         while pending_restore and time.monotonic() < end:
             with contextlib.suppress(SmpError):

@@ -32,7 +32,9 @@ SLOT_S = 0.005  # interval of the common time grid; the last sample in it counts
 MAX_LATE_SLOTS = 4  # slots by which one wheel's samples may come after another's
 FRAME_S = 1 / 30  # period of batches and of commands
 KEPT_S = 60.0  # length of the kept history
-COMMAND_S = 0.3  # age at which a command, or the connection of its sender, counts as lost
+COMMAND_S = 0.3  # age at which a command ends
+UNWATCHED_S = 0.5  # longest time for which nobody may watch the sender of commands
+BODY_TIMEOUT_S = 0.6  # from the last command to the body until skid_steer is idle
 ZERO_S = 1.0  # duration of zero commands after a drive
 DIAGNOSTICS_S = 3.0  # age at which a report is dropped
 
@@ -126,8 +128,8 @@ class LiveLink:
         self.hardware: dict[str, MotorDescription] = {}
         self.diagnostics: dict[str, tuple[float, int, str]] = {}
         self.armed = self.controlled = False  # whether commands pass; controllers are active
-        self.heard_at = -math.inf  # when the driver's page was last heard
-        self._halt, self._ticked = "", 0.0
+        self.watched_at = -math.inf  # when it was last known that the sender of commands lives
+        self._halt = ""
         self._plans: tuple[float, Mapping[str, Plan], float] | None = None
         self._body = (0.0, 0.0, -math.inf)  # m/s, rad/s, when commanded
         node = client.node
@@ -187,15 +189,17 @@ class LiveLink:
         """Return whether a node takes cmd_vel."""
         return bool(self._twists.get_subscription_count())
 
+    def is_body_idle(self) -> bool:
+        """Return whether skid_steer, after the last command to the body, yields the wheels."""
+        return time.monotonic() - self._body[2] > COMMAND_S + ZERO_S + BODY_TIMEOUT_S
+
     # The timer -------------------------------------------------------------------------------
 
     def _on_timer(self) -> None:
         now = time.monotonic()
         self._read()
-        late, self._ticked = now - self._ticked > COMMAND_S / 2, now
-        # After a pause of this process the sender may have been heard, and not been noted yet.
-        if self.armed and not late and now - self.heard_at > COMMAND_S:
-            self.halt(f"the page was not heard for {COMMAND_S:g} s")
+        if self.armed and now - self.watched_at > UNWATCHED_S:
+            self.halt(f"nobody watched the page for {UNWATCHED_S:g} s")
         if self._halt:
             self._stop_wheels()
         linear, angular, at = self._body

@@ -338,11 +338,15 @@ class RobotClient:
         if self._guard is not None:
             self._guard.note(pending_restore)
 
+    def prepare(self, pending_restore: Mapping[str, Any]) -> None:
+        """Get known to the controllers that :meth:`restore` halts, which takes time."""
+        for name in _halts(pending_restore):
+            self._client(ChangeState, name)
+
     def restore(self, pending_restore: Mapping[str, Any]) -> None:
         """Halt the wheels, set the previous gains and activate the controllers that were active."""
-        states = self.get_states(pending_restore.get("halt", ()))
-        if moving := [node for node, state in states.items() if state == "active"]:
-            self.change_states(moving, "deactivate")
+        if pending_restore.get("halt"):
+            self.ask_all(ChangeState, _halts(pending_restore))
             self.spin(HALT_S)
         if pending_restore.get("gains"):
             self.set_parameters(pending_restore["gains"])
@@ -406,3 +410,8 @@ class RobotClient:
         if UNKNOWN_NODE in self._commanders(wheel):
             return False
         return owner_known or self.node.count_publishers(f"{wheel}/motor_owner") == 0
+
+
+def _halts(pending_restore: Mapping[str, Any]) -> dict[str, ChangeState.Request]:
+    request = ChangeState.Request(transition=Transition(id=Transition.TRANSITION_DEACTIVATE))
+    return {f"{node}/change_state": request for node in pending_restore.get("halt", ())}

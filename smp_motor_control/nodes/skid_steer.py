@@ -3,6 +3,7 @@
 
 import math
 import time
+from collections import deque
 from collections.abc import Mapping
 from functools import partial
 from typing import Any
@@ -27,6 +28,8 @@ IMPLAUSIBLE_RATIO = 4.0  # wheel speed relative to its maximum that shows a coun
 DEFAULT_MAX_SPEED = 250.0  # plausible speed without a limit [rad/s]
 REPORT_TIME_S = 1.5  # time for which a refused command is reported, at least once
 LOOK_PERIOD_S = 0.2  # period of checking the publishers of cmd_vel
+OWN_SETPOINTS = 32  # own set-points that are recognised when they are heard
+YIELD_S = 0.3  # time for which an idle body is silent after another node's set-points
 STALLED_PERIODS = 3.0
 """Delay in periods after which a step is skipped once, to process queued messages first."""
 
@@ -52,6 +55,8 @@ class SkidSteerNode(Node):
         self._odometry = Odometry(*body, size)
         self._configure(settings)
         self._past_commands = [(0.0, 0.0), (0.0, 0.0)]  # (linear, angular) of the last two steps
+        self._sent: deque[int] = deque(maxlen=OWN_SETPOINTS)  # stamps of the last set-points
+        self._others_at = -math.inf  # when another node's set-points were heard
         self._share = 1.0
         self._late = False
         self._refused, self._refused_at = "", -math.inf
@@ -67,6 +72,7 @@ class SkidSteerNode(Node):
         )
         self._output = OdometryOutput(self, settings)
         best_effort = runtime.STREAM_SUBSCRIBER
+        self.create_subscription(JointState, "wheel_setpoints", self._on_setpoints, best_effort)
         self._preferred = TwistStamped if settings.use_stamped_vel else Twist
         self._unheard = ""
         self._listen_to(self._preferred)
@@ -133,6 +139,16 @@ class SkidSteerNode(Node):
             old = f" ({age:.3f} s)" if verdict is Verdict.STALE else ""
             self.get_logger().warning(f"cmd_vel {verdict.value}{old}", throttle_duration_sec=1.0)
 
+    def _on_setpoints(self, message: JointState) -> None:
+        """Note set-points of other nodes, which an idle body leaves alone."""
+        if runtime.nanoseconds(message.header.stamp) not in self._sent:
+            self._others_at = time.monotonic()
+
+    def _yields(self, now: float) -> bool:
+        """Return whether the body stands by its command, and another node sends set-points."""
+        idle = self._command.timed_out(now) and not any(self._past_commands[0])
+        return idle and now - self._others_at < YIELD_S
+
     def _on_state(self, wheel: str, message: MotorState, info: Mapping[str, Any]) -> None:
         watch = self._states[wheel]
         restarted = watch.hear(info)
@@ -172,7 +188,7 @@ class SkidSteerNode(Node):
         if dt < MIN_STEP_S and not jumped:
             return
         asked = self._command.at(now)
-        if asked is not None:
+        if asked is not None and not self._yields(now):
             self._drive(asked, max(dt, MIN_STEP_S), now)
         if settings.open_loop:
             updated = asked is not None and self._odometry.update_open_loop(
@@ -195,6 +211,7 @@ class SkidSteerNode(Node):
         left, right = self._robot.reachable_wheel_speeds(linear, corrected)
         self._share = share
         self._setpoint.header.stamp = self.get_clock().now().to_msg()
+        self._sent.append(runtime.nanoseconds(self._setpoint.header.stamp))
         self._setpoint.velocity = [left] * len(self._left) + [right] * len(self._right)
         self._setpoints.publish(self._setpoint)
 

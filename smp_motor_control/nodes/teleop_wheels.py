@@ -222,8 +222,6 @@ class TeleopWheels(Node):
             every = len(keyboard.selected) == len(self._wheels)
             chosen = "all" if every else min(keyboard.selected)
             line = f"wheel mode  {keyboard.scale * speeds.wheel:.2f} rad/s  {chosen}  | {state}"
-            if takers and self.count_publishers(self._setpoints.topic_name) > 1:
-                line += "  (skid_steer also commands the wheels: use body mode)"
         line += "" if takers else "  (no subscriber)"
         self._terminal.write(f"\r{line[: shutil.get_terminal_size().columns - 1]}\x1b[K")
 

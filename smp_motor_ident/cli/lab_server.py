@@ -30,6 +30,7 @@ from smp_motor_ident.report import templates
 
 QUEUED = 60  # messages that wait for a slow page before it is closed
 MAX_MESSAGE = 10_000  # length of a request [bytes]
+WATCH_S, LOST_S = 0.03, 0.3  # interval of watching, and silence that stops the wheels
 ABANDONED_S = 2.0  # silence after which another page may take the place of the one that drives
 HEADERS = {
     "Referrer-Policy": "no-referrer",
@@ -120,7 +121,7 @@ class Server:
             await site.start()
             self._port = runner.addresses[0][1]
             ready.set_result(None)
-            await self._ended.wait()
+            await self._watch()
         except OSError as error:
             where = f"{self._host}:{self._port}"
             ready.set_exception(ProcessError(f"{where}: {error.strerror}; choose another --port"))
@@ -128,6 +129,18 @@ class Server:
             for page in list(self._pages):
                 await page.socket.close(code=1001, message=b"lab ended")
             await runner.cleanup()
+
+    async def _watch(self) -> None:
+        """Stop the wheels when the page that drives is heard no more."""
+        link, before = self._laboratory.link, time.monotonic()
+        while not self._ended.is_set():
+            await asyncio.sleep(WATCH_S)
+            now, driver = time.monotonic(), self._driver
+            late, before = now - before > LOST_S / 2, now
+            # After a pause of this process the page may have been heard, and not been read yet.
+            if link.armed and not late and (driver is None or now - driver.heard_at > LOST_S):
+                link.halt(f"the page was not heard for {LOST_S:g} s")
+            link.watched_at = now
 
     # Access ---------------------------------------------------------------------------------------
 
@@ -184,7 +197,7 @@ class Server:
         """Serve a report, or a file of gains."""
         name, file = request.match_info["name"], request.match_info["file"]
         state, folder = self._laboratory.state, self._laboratory.folder
-        if file == "report.html" and name == (state["identified"] or {}).get("name"):
+        if file == "report.html" and name == state["identified"]:
             path = folder / name / file
         elif name == "gains" and file == (state["designed"] or {}).get("name"):
             path = folder / file
@@ -226,9 +239,7 @@ class Server:
 
     async def _take(self, page: Page, text: str) -> None:
         """Take a message of a page; a refused one is answered with the reason."""
-        page.heard_at = now = time.monotonic()
-        if page is self._driver:
-            self._laboratory.link.heard_at = now
+        page.heard_at = time.monotonic()
         try:
             message = json.loads(text)
             await self._do(page, message)

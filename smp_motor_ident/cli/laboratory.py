@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from smp_motor_control import WHEELS, controller_of
+from smp_motor_control import WHEELS, check_wheel_names, controller_of
 from smp_motor_control.arrays import Array
 from smp_motor_control.errors import SmpError
 from smp_motor_control.excitation import SIGNALS
@@ -35,10 +35,9 @@ MAX_AMPLITUDE_SHARE = 1.0  # largest amplitude of an excitation [share of the su
 SHORTEST_S, LONGEST_S = 0.5, 300.0  # of an excitation
 TRIAL_S = 2.5  # for which gains on trial are watched
 STEP_AT_S, STEP_LASTS_S = 0.3, 1.2  # begin and length of the step of a trial
-QUIET_S = 4.0  # longest wait for other set-points to end
 STATE_S = 0.1  # shortest time between two messages about the state
 BACKGROUND = -10  # priority of what computes beside the robot
-MESSAGES = 6  # that a page shows
+MESSAGES = 3  # that a page shows of a kind
 COMBINATIONS = ("dc_gain", "time_constant", "time_constant_product", "static_voltage")
 
 
@@ -65,6 +64,7 @@ def work(arguments: argparse.Namespace) -> int:
             demonstration.start(robot, motors, arguments.rate)
         else:
             print("looking for the wheels that report, which takes some 5 s", flush=True)
+            check_wheel_names(tuple(arguments.wheel or WHEELS))
             wheels = tuple(arguments.wheel or ()) or commissioning.find_wheels(client)
             robot = steps.Robot(processes, client, wheels or WHEELS, folder, ros, bounds)
             client.wait_for_wheels(robot.wheels, timeout=15.0)
@@ -93,7 +93,7 @@ class Laboratory:
         self.state: dict[str, Any] = {
             "wheels": robot.wheels, "columns": COLUMNS, "slot": SLOT_S, "signals": [*SIGNALS],
             "armed": False, "job": "", "progress": "", "messages": [], "supply": {},
-            "recordings": [], "learned": {}, "identified": {}, "designed": None, "trial": None,
+            "recordings": [], "motors": {}, "identified": "", "designed": None, "trial": None,
             "diagnostics": [], "drives": False,
         }  # fmt: skip
         self._slot_s, self._speed = SLOT_S, COLUMNS.index("speed")
@@ -116,9 +116,14 @@ class Laboratory:
 
     def __exit__(self, *_: object) -> None:
         """Stop the wheels, and give the controllers back."""
+        client = self.robot.client
         self.link.halt("lab ends")
-        self.robot.client.spin(2 * STATE_S)
+        client.spin(2 * STATE_S)
         self.robot.processes.stop("excite", "record", "identifier", "identify")
+        if self._taken:
+            self._activate(False)
+            pending = client.pending_restore
+            client.set_pending_restore(**{n: v for n, v in pending.items() if n != "halt"})
         self._stack.close()
 
     def run(self) -> None:
@@ -160,9 +165,11 @@ class Laboratory:
             for name, value, std in zip(message.names, message.values, message.std_devs)
             if name in UNITS
         }
-        rows = [[words.label(name), words.state(one)] for name, one in found.items()]
-        fit = None if math.isnan(message.fit_percent) else round(message.fit_percent, 1)
-        self.state["learned"][wheel] = {"status": message.status, "fit": fit, "rows": rows}
+        self.state["motors"][wheel] = {
+            "state": message.status, "findings": [],
+            "fit": None if math.isnan(message.fit_percent) else message.fit_percent,
+            "values": {words.label(name): [words.state(one)] for name, one in found.items()},
+        }  # fmt: skip
         hardware = self.link.hardware.get(wheel)
         model = {n: float(found[n].value or 0.0) for n in COMBINATIONS if n in found}
         if hardware is not None and {"dc_gain", "time_constant"} <= set(model):
@@ -252,7 +259,7 @@ class Laboratory:
             controllers = [controller_of(wheel) for wheel in self.robot.wheels]
             client.set_pending_restore(**client.pending_restore, halt=controllers)
             self._taken = True
-        link.heard_at, link.armed = time.monotonic(), True
+        link.watched_at, link.armed = time.monotonic(), True
         self._activate(True)
 
     def _activate(self, active: bool) -> None:
@@ -276,7 +283,7 @@ class Laboratory:
         processes, ros = self.robot.processes, self.robot.ros_arguments
         processes.stop("identifier")
         self._models.clear()
-        self.state["learned"] = {}
+        self.state["motors"] = {}
         listed = f"wheels:=[{', '.join(wheels)}]"
         window = min(max(duration, 5.0), 60.0)
         processes.start(
@@ -329,17 +336,15 @@ class Laboratory:
         self.robot.processes.stop("identify")
         if not (output / "identification.json").is_file():
             raise ParameterError(last)
-        self.state["identified"] = {
-            "name": output.name,
-            "wheels": {w: _shown(one) for w, one in read_identification(output).items()},
-        }
-        self.state["designed"] = None
-        self.tell(f"Identified {', '.join(self.state['identified']['wheels'])}.")
+        found = read_identification(output)
+        self.state["motors"] = {wheel: _shown(one) for wheel, one in found.items()}
+        self.state["identified"], self.state["designed"] = output.name, None
+        self.tell(f"Identified {', '.join(found)}.")
 
     def _tune(self, accept: bool) -> None:
         if not self.state["identified"]:
             raise ParameterError("no motor is identified yet; identify the motors first")
-        name = self.state["identified"]["name"]
+        name = self.state["identified"]
         gains = self.folder / f"gains_{next(self._numbers)}.yaml"
         asked = self.designs.submit(lab_designs.design, self.folder / name, gains, accept)
         self._wait(asked.done)
@@ -359,7 +364,7 @@ class Laboratory:
         client, new = self.robot.client, dict(made["parameters"])
         node = controller_of(wheel)
         old = client.get_parameters({node: list(new)})[node]
-        self._wait_for_quiet()
+        self._wait(self.link.is_body_idle, moving=True)
         self._activate(True)
         self.link.follow({wheel: [(0.0, 0.0)]})
         outcome = try_gains(
@@ -376,7 +381,7 @@ class Laboratory:
     def _step(self, wheel: str) -> None:
         if wheel not in self._candidates:
             raise ParameterError(f"{wheel or 'no wheel'} has no design; its step would be unknown")
-        self._wait_for_quiet()
+        self._wait(self.link.is_body_idle, moving=True)
         self._activate(True)
         self._begin_step(wheel)
         end = time.monotonic() + STEP_AT_S + STEP_LASTS_S
@@ -402,20 +407,6 @@ class Laboratory:
         known = np.isfinite(mine[shown, self._speed])
         speed = mine[shown, self._speed][known]
         self.send("step", {"wheel": wheel, "time": time_s[known].tolist(), "speed": speed.tolist()})
-
-    def _wait_for_quiet(self) -> None:
-        """Wait until the set-points of a drive have ended."""
-        from smp_motor_control.nodes.driving import refuse_rivals
-
-        self.link.rest()
-        end = time.monotonic() + QUIET_S
-        while True:
-            try:
-                refuse_rivals(self.robot.client)
-                return
-            except SmpError:
-                if time.monotonic() > end:
-                    raise
 
     def _decide(self, keep: bool) -> None:
         if not self._before:
@@ -461,12 +452,11 @@ class Prediction:
 def _shown(estimate: Any) -> dict[str, Any]:
     """Return what a page shows of an identified motor."""
     held = {**estimate.combinations, **estimate.parameters}
-    grave = [one for one in estimate.findings if one.severity != "note"]
+    grave = [one for one in estimate.findings if one.severity != "note"][:MESSAGES]
+    unreliable = any(one.severity in ("unreliable", "refused") for one in grave)
     return {
-        "rows": [
-            [words.label(n), words.state(q), words.systematic(q)] for n, q in held.items()
-        ],
+        "state": "unreliable" if unreliable else "identified",
         "fit": estimate.fit_percent.validation or estimate.fit_percent.estimation,
-        "findings": [[one.severity, f"{words.to_sentence(one.message)} {one.advice}"] for one in grave[:3]],
-        "unreliable": any(one.severity in ("unreliable", "refused") for one in grave),
+        "values": {words.label(n): [words.state(q), words.systematic(q)] for n, q in held.items()},
+        "findings": [[f.severity, f"{words.to_sentence(f.message)} {f.advice}"] for f in grave],
     }

@@ -7,7 +7,7 @@
   const row = (...cells) => { const one = make("tr"); one.append(...cells.map(cell => cell instanceof Node ? cell : make("td", cell))); return one; };
   const label = wheel => { const text = wheel.replaceAll("_", " "); return text[0].toUpperCase() + text.slice(1); };
   const KEPT = 60, PLOT = {speed: 200, voltage: 160};
-  let state = {wheels: [], columns: [], slot: 0.005, messages: [], supply: {}, diagnostics: [], recordings: [], learned: {}, identified: {}};
+  let state = {wheels: [], columns: [], slot: 0.005, messages: [], supply: {}, diagnostics: [], recordings: [], motors: {}, identified: ""};
   let role = {drives: false, free: false, pages: 1};
   let designs = {}, pending = null, waiting = false, counter = 0;
 
@@ -44,7 +44,7 @@
   // Samples: one row for each slot of time, the columns of every wheel --------------------------------
 
   const times = [], values = [];  // values: one array for each wheel and column
-  let paused = false, zoomed = null, dirty = false, drawn = 0, cost = 0, told = 0;
+  let paused = false, zoomed = null, dirty = false, drawn = 0, cost = 0, told = 0, pointed = null;
 
   function take(table) {
     const width = 1 + state.wheels.length * state.columns.length;
@@ -62,7 +62,7 @@
     setTimeout(() => requestAnimationFrame(draw), Math.max(0, drawn + 3 * cost - performance.now()));
   }
   const column = (wheel, name) => values[state.wheels.indexOf(wheel) * state.columns.length + state.columns.indexOf(name)] || [];
-  const newest = list => { for (let k = list.length - 1; k >= Math.max(0, list.length - 40); k--) if (list[k] != null) return list[k]; return null; };
+  const before = (list, end) => { for (let k = end; k >= Math.max(0, end - 40); k--) if (list[k] != null) return list[k]; return null; };
   const from = time => { let low = 0, high = times.length; while (low < high) { const middle = (low + high) >> 1; if (times[middle] < time) low = middle + 1; else high = middle; } return low; };
 
   const SHOWN = {
@@ -74,8 +74,7 @@
 
   function plot(place, wheel, kind) {
     const axis = {stroke: () => color("muted"), grid: {stroke: () => color("grid"), width: 1}, ticks: {show: false}};
-    const value = (u, v) => written(v);
-    const series = SHOWN[kind].map(([name, , shade, width, dash]) => ({label: name, stroke: () => color(shade), width, dash, spanGaps: true, points: {show: false}, value, scale: name.endsWith("[A]") ? "A" : "y"}));
+    const series = SHOWN[kind].map(([name, , shade, width, dash]) => ({label: name, stroke: () => color(shade), width, dash, spanGaps: true, points: {show: false}, scale: name.endsWith("[A]") ? "A" : "y"}));
     const limit = () => (kind === "voltage" ? state.supply[wheel] : 0) || 0;
     const ends = u => { const most = kind === "voltage" && limit() ? 1.08 * limit() : Math.max(1, u.most || 0); return [-most, most]; };
     const lines = u => {
@@ -87,10 +86,14 @@
     const axes = [{...axis, size: 28, values: (u, marks) => marks.map(v => `${written(v)} s`)}, {...axis, size: 50, label: kind === "speed" ? "rad/s" : "V", labelSize: 18}];
     if (kind === "voltage") axes.push({...axis, scale: "A", side: 1, size: 46, label: "A", labelSize: 18, grid: {show: false}});
     const u = new uPlot({
-      width: place.clientWidth || 360, height: PLOT[kind], axes, series: [{label: "time [s]", value}, ...series],
+      width: place.clientWidth || 280, height: PLOT[kind], axes, series: [{}, ...series], legend: {show: false},
       scales: {x: {time: false}, y: {range: ends}, A: {range: () => { const most = Math.max(0.1, u.amps || 0); return [-most, most]; }}},
-      cursor: {sync: {key: "watch"}, drag: {setScale: false}, bind: {dblclick: () => () => { pause(false); }}},
-      hooks: {draw: [lines], setSelect: [() => { if (u.select.width > 4) { zoomed = [u.posToVal(u.select.left, "x"), u.posToVal(u.select.left + u.select.width, "x")]; pause(true); u.setSelect({left: 0, width: 0}, false); } }]},
+      cursor: {sync: {key: "watch"}, drag: {setScale: false}, bind: {dblclick: () => () => pause(false)}},
+      hooks: {
+        draw: [lines],
+        setCursor: [() => { pointed = u.cursor.idx == null || u.cursor.left < 0 ? null : u.data[0][u.cursor.idx]; tell(); }],
+        setSelect: [() => { if (u.select.width > 4) { zoomed = [u.posToVal(u.select.left, "x"), u.posToVal(u.select.left + u.select.width, "x")]; pause(true); u.setSelect({left: 0, width: 0}, false); } }],
+      },
     }, [[], ...series.map(() => [])], place);
     u.wheel = wheel; u.kind = kind;
     plots.push(u);
@@ -109,7 +112,7 @@
   }
   function tell() {
     for (const wheel of state.wheels) {
-      const panel = part(wheel), now = name => newest(column(wheel, name)), text = (v, unit, digits) => v == null ? "–" : `${v.toFixed(digits)} ${unit}`;
+      const panel = part(wheel), now = name => before(column(wheel, name), pointed == null ? times.length - 1 : from(pointed)), text = (v, unit, digits) => v == null ? "–" : `${v.toFixed(digits)} ${unit}`;
       const target = now("setpoint"), speed = now("speed");
       for (const [name, value, unit] of [["speed", speed, "rad/s"], ["setpoint", target, "rad/s"], ["error", target == null || speed == null ? null : target - speed, "rad/s"], ["voltage", now("voltage"), "V"], ["current", now("current"), "A"]])
         panel.querySelector(`.${name}`).textContent = text(value, unit, 2);
@@ -145,23 +148,23 @@
   // State and roles ---------------------------------------------------------------------------------
 
   function show(content) {
-    const before = state;
+    const old = state;
     state = content;
     part("arm").setAttribute("aria-pressed", state.armed);
     part("arm").textContent = state.armed ? "Armed" : "Arm";
     const doing = state.job ? `${state.job[0].toUpperCase()}${state.job.slice(1)}${state.progress ? `: ${state.progress}` : ""} …` : "";
     part("job").textContent = doing || (state.armed ? "Armed: the wheels may turn." : "Nothing moves before Arm. Put the robot on blocks first.");
-    if (changed(before.messages, state.messages)) list("messages", state.messages.slice(-2).map(([, kind, text]) => [{error: "refused", stop: "warning"}[kind] || "", text]));
+    if (changed(old.messages, state.messages)) list("messages", state.messages.slice(-2).map(([, kind, text]) => [{error: "refused", stop: "warning"}[kind] || "", text]));
     list("diagnostics", state.diagnostics.map(([name, level, text]) => ["", `${name}: ${["", "warning: ", "error: ", "stale: "][level]}${text}`]));
     for (const wheel of state.wheels) {
       const [, level, text] = state.diagnostics.find(([name]) => name.endsWith(`${wheel}/wheel_pid`)) || ["", 0, "no wheel_pid"];
       Object.assign(part(wheel).querySelector(".health"), {textContent: text, className: `small health ${["", "warn", "bad", "bad"][level]}`});
     }
-    if (changed(before.signals, state.signals)) part("signal").replaceChildren(...state.signals.map(name => make("option", name)));
-    if (changed(before.signals, state.signals) && state.signals.includes("fourier")) part("signal").value = "fourier";
+    if (changed(old.signals, state.signals)) part("signal").replaceChildren(...state.signals.map(name => make("option", name)));
+    if (changed(old.signals, state.signals) && state.signals.includes("fourier")) part("signal").value = "fourier";
     part("recordings").textContent = state.recordings.length ? `Recorded: ${state.recordings.join(", ")}.` : "No recording.";
-    if (changed(before.learned, state.learned)) part("learned").replaceChildren(...Object.entries(state.learned).map(([wheel, one]) => row(label(wheel), one.rows.map(([name, value]) => `${name} ${value}`).join("; ") || "–", one.fit == null ? one.status : `${one.status}, fit ${one.fit} %`)));
-    if (changed(before.identified, state.identified)) showIdentified(state.identified.wheels || {}, state.identified.name);
+    if (changed(old.motors, state.motors)) showMotors(state.motors);
+    if (old.identified !== state.identified) showReport(state.identified);
     const made = state.designed;
     part("designed").textContent = made ? `${made.name}: ${made.reason}.` : "No design.";
     part("gains").hidden = !made;
@@ -172,9 +175,13 @@
   }
   const changed = (before, now) => JSON.stringify(before) !== JSON.stringify(now);
   const list = (id, lines) => part(id).replaceChildren(...lines.map(([kind, text]) => make("li", text, kind)));
-  function showIdentified(wheels, name) {
-    part("identified").replaceChildren(...Object.entries(wheels).flatMap(([wheel, one]) => one.rows.map(([quantity, value, systematic], k) => row(k ? "" : `${label(wheel)}${one.fit == null ? "" : `, fit ${one.fit.toFixed(1)} %`}`, quantity, value, systematic))));
-    list("findings", Object.entries(wheels).flatMap(([wheel, one]) => one.findings.map(([severity, text]) => [severity, `${label(wheel)}: ${text}`])));
+  function showMotors(motors) {
+    const names = new Set(Object.values(motors).flatMap(one => Object.keys(one.values)));
+    const cells = what => state.wheels.map(wheel => { const [text, note] = (motors[wheel] && what(motors[wheel])) || ["–"], one = make("td", text); if (note) one.append(make("small", note)); return one; });
+    part("motors").tBodies[0].replaceChildren(row("State", ...cells(one => [one.state, one.fit == null ? "" : `fit ${one.fit.toFixed(1)} %`])), ...[...names].map(name => row(name, ...cells(one => one.values[name]))));
+    list("findings", Object.entries(motors).flatMap(([wheel, one]) => one.findings.map(([severity, text]) => [severity, `${label(wheel)}: ${text}`])));
+  }
+  function showReport(name) {
     part("report").querySelector("iframe")?.remove();
     part("report").open = false;
     part("report").dataset.source = name ? `/results/${name}/report.html` : "";
@@ -192,7 +199,7 @@
     enable();
   }
   function enable() {
-    const may = {excite: state.armed, apply: state.armed && designs[part("wheel").value]?.parameters, step: state.armed && designs[part("wheel").value], identify: state.recordings.length, discard: state.recordings.length, tune: state.identified.name, keep: state.trial, back: state.trial, arm: !state.armed};
+    const may = {excite: state.armed, apply: state.armed && designs[part("wheel").value]?.parameters, step: state.armed && designs[part("wheel").value], identify: state.recordings.length, discard: state.recordings.length, tune: state.identified, keep: state.trial, back: state.trial, arm: !state.armed};
     for (const [id, possible] of Object.entries(may)) part(id).disabled = !role.drives || Boolean(state.job) || !possible;
     for (const one of document.querySelectorAll("fieldset")) one.disabled = !role.drives;
     for (const id of ["share", "phase_margin", "p", "i", "d"]) part(id).disabled = !role.drives || !Object.keys(designs).length;
@@ -300,7 +307,7 @@
   const REST = 0.6, LEAST = 0.3, SMOOTH = 5;
   let judged = 0;
   function settle() {
-    const end = times.at(-1), rests = state.wheels.map(wheel => newest(column(wheel, "setpoint")));
+    const end = times.at(-1), rests = state.wheels.map(wheel => before(column(wheel, "setpoint"), times.length - 1));
     if (rests.some(v => v == null) || end - judged < 0.2) return;
     judged = end;
     const found = state.wheels.map((wheel, w) => {

@@ -12,7 +12,7 @@ import pytest
 from body_peer import JOINTS, repeatedly
 from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import Twist, TwistStamped
-from sensor_msgs.msg import Imu
+from sensor_msgs.msg import Imu, JointState
 
 from smp_motor_control.nodes.odometry_output import frame_prefix
 
@@ -70,6 +70,32 @@ def test_command_turns_all_four_wheels_and_its_timeout_stops_them(skid_steer, pe
     repeatedly(peer, lambda: peer.feed_all(0.0, 0.0), lambda: peer.diagnosis("idle"), eventually)
     assert peer.diagnostics[-1].level == DiagnosticStatus.OK
     repeatedly(peer, lambda: peer.command(1.0), lambda: peer.drives(10.0, 10.0), eventually, 1.0)
+
+
+def test_an_idle_body_leaves_the_wheels_to_another_node(skid_steer, peer, eventually):
+    skid_steer()
+    repeatedly(peer, lambda: peer.command(1.0), lambda: peer.drives(10.0, 10.0), eventually)
+    eventually(lambda: peer.drives(0.0, 0.0), deadline=3.0, step=peer.spin)
+    own = peer.node.create_publisher(JointState, "/wheel_setpoints", 10)
+    message = JointState(name=list(JOINTS), velocity=[1.5] * len(JOINTS))
+
+    def send() -> None:
+        message.header.stamp = peer.node.get_clock().now().to_msg()
+        own.publish(message)
+
+    def is_alone() -> bool:
+        peer.setpoints.clear()
+        for _ in range(10):
+            send()
+            peer.spin_for(0.02)
+        return {v for one in peer.setpoints for v in one.velocity} == {1.5}
+
+    eventually(is_alone, deadline=5.0)
+    # A body that is commanded does not yield, and one without rivals holds the wheels again.
+    repeatedly(
+        peer, lambda: (send(), peer.command(1.0)), lambda: peer.drives(10.0, 10.0), eventually
+    )
+    eventually(lambda: peer.drives(0.0, 0.0), deadline=3.0, step=peer.spin)
 
 
 def test_plain_and_stamped_twist_are_understood_one_after_the_other(skid_steer, peer, eventually):

@@ -1,0 +1,379 @@
+# SPDX-License-Identifier: Apache-2.0
+"""lab with a simulated robot: the procedure by clicks in a browser, and who may drive, and when."""
+
+import asyncio
+import contextlib
+import json
+import re
+import signal
+import subprocess
+import threading
+import time
+from pathlib import Path
+
+import pytest
+import yaml
+from browser import CHROMIUM, Browser
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from domain_node import DomainNode
+from wheel_robot import two_wheeled
+
+from smp_interfaces.msg import MotorState
+from smp_motor_control import WHEELS
+from smp_motor_ident.report import words
+from smp_motor_ident.report.document import read_identification
+
+aiohttp = pytest.importorskip("aiohttp")
+
+STANDSTILL = 0.05  # [rad/s]
+WITHIN_S = 0.5  # from the event to standstill
+LOST_S = 0.3  # silence of a page that counts as a lost connection
+
+
+class Watcher(DomainNode):
+    """Listens to the wheels in a thread."""
+
+    def __init__(self, domain: int, wheels: tuple[str, ...]) -> None:
+        super().__init__(domain, "watcher")
+        self.samples: dict[str, list[tuple[float, float]]] = {wheel: [] for wheel in wheels}
+        for wheel in wheels:
+            topic = f"/{wheel}/motor_state"
+            self.node.create_subscription(
+                MotorState, topic, lambda m, wheel=wheel: self._take(wheel, m), 100
+            )
+        self.reports = self.node.create_publisher(DiagnosticArray, "/diagnostics", 10)
+        self._ended = False
+        self._thread = threading.Thread(target=self._run, daemon=True)
+        self._thread.start()
+
+    def _take(self, wheel: str, message: MotorState) -> None:
+        stamp = message.header.stamp
+        self.samples[wheel].append((stamp.sec + 1e-9 * stamp.nanosec, message.velocity))
+
+    def _run(self) -> None:
+        while not self._ended:
+            self.executor.spin_once(timeout_sec=0.05)
+
+    def close(self) -> None:
+        self._ended = True
+        self._thread.join()
+        super().close()
+
+    def speeds(self) -> list[float]:
+        return [one[-1][1] if one else 0.0 for one in self.samples.values()]
+
+    def stood_after(self, instant: float) -> float:
+        """Return the time from an instant to the last sample in motion, of any wheel."""
+        moving = [t for one in self.samples.values() for t, v in one if abs(v) > STANDSTILL]
+        return max([t - instant for t in moving if t > instant], default=0.0)
+
+
+@pytest.fixture
+def watcher(ros_domain):
+    made = []
+
+    def make(*wheels):
+        made.append(Watcher(ros_domain, wheels))
+        return made[-1]
+
+    yield make
+    for one in made:
+        one.close()
+
+
+def address(lab, eventually, after: int = 0) -> str:
+    """Return the newest address that lab printed, once there are more than so many."""
+    found = lambda: re.findall(r"http://\S+", lab.output)  # noqa: E731
+    eventually(lambda: len(found()) > after or lab.returncode is not None, deadline=60.0)
+    assert lab.returncode is None, lab.output
+    return found()[-1]
+
+
+class Client:
+    """A page without a browser: it beats, drives and reads the state."""
+
+    def __init__(self, url: str) -> None:
+        self.origin = url.partition("/?")[0]
+        self.url, self.state, self.role, self.refusals = url, {}, {}, []
+        self.drive: tuple[float, float] | None = None
+        self.frames = 0
+
+    async def __aenter__(self):
+        self.session = aiohttp.ClientSession(cookie_jar=aiohttp.CookieJar(unsafe=True))
+        async with self.session.get(self.url) as answer:
+            assert answer.status == 200, await answer.text()
+        address = self.origin.replace("http", "ws") + "/ws"
+        self.socket = await self.session.ws_connect(address, origin=self.origin)
+        self.tasks = [asyncio.ensure_future(one()) for one in (self._read, self._beat)]
+        return self
+
+    async def __aexit__(self, *_):
+        self.silence()
+        await self.session.close()
+
+    def silence(self) -> None:
+        for task in self.tasks:
+            task.cancel()
+
+    async def send(self, what: str, **more) -> None:
+        await self.socket.send_str(json.dumps({"do": what, **more}))
+
+    async def _beat(self) -> None:
+        while True:
+            if self.drive is None:
+                await self.send("beat")
+            else:
+                await self.send("drive", linear=self.drive[0], angular=self.drive[1])
+            await asyncio.sleep(0.05)
+
+    async def _read(self) -> None:
+        async for message in self.socket:
+            if message.type is aiohttp.WSMsgType.BINARY:
+                self.frames += 1
+                continue
+            kind, content = json.loads(message.data)
+            if kind in ("state", "role"):
+                setattr(self, kind, content)
+            elif kind == "refused":
+                self.refusals.append(content)
+
+    async def until(self, condition, seconds: float = 60.0) -> None:
+        end = time.monotonic() + seconds
+        while not condition():
+            assert time.monotonic() < end, (self.state, self.refusals)
+            await asyncio.sleep(0.02)
+
+
+@pytest.fixture
+def two_wheels(process, watcher, eventually, tmp_path):
+    """A robot of two wheels that drives, with its own controllers, and lab beside it."""
+    motors, gains = two_wheeled(tmp_path)
+    process("motor_plant", "--ros-args", "-p", f"motors_file:={motors}")
+    for wheel in ("left", "right"):
+        process("wheel_pid", "--ros-args", "-r", f"__ns:=/{wheel}", "--params-file", str(gains))
+    names = ("-p", "left_wheel_names:=[left]", "-p", "right_wheel_names:=[right]")
+    process("skid_steer", "--ros-args", *names, "-p", "linear.x.max_acceleration:=1.0")
+    watching = watcher("left", "right")
+    eventually(lambda: all(watching.samples.values()), 30.0)
+    lab = process("lab", "--no-browser")
+    return lab, watching, address(lab, eventually)
+
+
+CUTS = ("stop", "closed", "silent", "second page", "killed")
+
+
+@pytest.mark.parametrize("cut", CUTS)
+def test_the_wheels_stand_half_a_second_after(two_wheels, eventually, cut):
+    lab, watching, url = two_wheels
+
+    async def drive_and_cut() -> float:
+        async with contextlib.AsyncExitStack() as stack:
+            page = await stack.enter_async_context(Client(url))
+            await page.until(lambda: page.role.get("drives") and page.state.get("wheels"))
+            await page.send("drive", linear=0.2, angular=0.0)  # before it is armed
+            await page.send("arm")
+            await page.until(lambda: page.state["armed"] and not page.state["job"])
+            assert max(map(abs, watching.speeds())) < STANDSTILL
+            page.drive = 0.2, 0.0
+            await page.until(lambda: min(watching.speeds()) > 1.9)
+            if cut == "second page":
+                other = Client(address(lab, eventually, 1))
+                cut_at = time.time()
+                await stack.enter_async_context(other)
+            else:
+                cut_at = time.time()
+                if cut == "stop":
+                    await page.send("stop")
+                elif cut == "closed":
+                    page.silence()
+                    await page.socket.close()
+                elif cut == "silent":
+                    page.silence()
+                else:
+                    lab.send_signal(signal.SIGKILL)
+            await asyncio.sleep(3.0)
+            if cut in ("stop", "second page"):
+                assert not page.state["armed"] and page.state["messages"]
+                assert page.frames > 20
+            return cut_at
+
+    cut_at = asyncio.run(drive_and_cut())
+    assert watching.stood_after(cut_at) < WITHIN_S + (LOST_S if cut == "silent" else 0.0)
+
+
+def test_strangers_stay_outside_and_one_page_drives(two_wheels, eventually):
+    lab, watching, url = two_wheels
+    origin, _, token = url.partition("/?token=")
+
+    async def knock() -> None:
+        async with aiohttp.ClientSession(cookie_jar=aiohttp.CookieJar(unsafe=True)) as session:
+
+            async def status(path: str = "/", **headers: str) -> int:
+                async with session.get(origin + path, headers=headers) as answer:
+                    return int(answer.status)
+
+            upgrade = {"Upgrade": "websocket", "Connection": "Upgrade"}
+            assert await status() == 403
+            assert await status("/?token=wrong") == 403
+            assert await status(f"/?token={token}", Host="evil.example") == 403
+            assert await status("/ws", Origin=origin, **upgrade) == 403
+            assert await status(f"/?token={token}") == 200
+            assert await status("/") == 200  # by its cookie
+            assert await status("/ws", Origin="http://evil.example", **upgrade) == 403
+            assert await status("/ws", **upgrade) == 403
+            assert await status("/results/..%2F..%2Fetc/passwd") == 404
+            assert await status("/results/logs/lab.log") == 404
+        async with aiohttp.ClientSession() as session, session.get(url) as answer:
+            assert answer.status == 403  # a token opens one page
+        async with Client(address(lab, eventually, 1)) as first:
+            await first.until(lambda: first.role.get("drives"))
+            async with Client(address(lab, eventually, 2)) as second:
+                await second.until(lambda: second.role.get("pages") == 2)
+                assert not second.role["drives"]
+                for asked in ("arm", "excite", "identify", "drive"):
+                    await second.send(asked, linear=0.2, angular=0.0)
+                await second.until(lambda: len(second.refusals) == 4)
+                await second.send("take")
+                await second.until(lambda: len(second.refusals) == 5)
+                assert "another page drives" in second.refusals[-1]
+            for wrong in ("{", "[]", '{"do": 7}', '{"do": "fly"}', '{"do": "excite"}', '"x" * 9'):
+                await first.socket.send_str(wrong)
+            await first.until(lambda: len(first.refusals) == 6)
+            assert not first.state["armed"]
+            await first.send("arm")
+            await first.until(lambda: first.state["armed"] and not first.state["job"])
+            for amplitude, seconds in ((99.0, 1.0), (float("nan"), 1.0), (1.0, 9e9)):
+                given = dict(wheels=["left"], signal="sine", amplitude=amplitude, seconds=seconds)
+                told = len(first.state["messages"])
+                await first.send("excite", **given)
+                await first.until(
+                    lambda told=told: [k for _, k, _ in first.state["messages"]][told:] == ["error"]
+                )
+
+    asyncio.run(knock())
+    assert max(map(abs, watching.speeds())) < STANDSTILL
+    lab.interrupt()
+    lab.wait(30.0)
+    eventually(lambda: all(abs(v) < STANDSTILL for v in watching.speeds()))
+
+
+def test_an_address_of_another_machine_is_told_loudly(process, eventually):
+    process("motor_plant")
+    lab = process("lab", "--no-browser", "--host", "0.0.0.0")
+    address(lab, eventually)
+    assert "WARNING: served on 0.0.0.0" in lab.output
+
+
+class Clicks:
+    """A page in a browser, as a person uses it."""
+
+    def __init__(self, browser: Browser) -> None:
+        self.browser = browser
+
+    def value(self, expression: str):
+        return self.browser.value(expression)
+
+    def text(self, name: str) -> str:
+        return str(self.value(f"document.getElementById('{name}').innerText"))
+
+    def until(self, expression: str, seconds: float = 90.0) -> None:
+        end = time.monotonic() + seconds
+        while not self.value(f"Boolean({expression})"):
+            assert time.monotonic() < end, (expression, self.text("job"), self.text("messages"))
+            time.sleep(0.1)
+
+    def click(self, name: str) -> None:
+        """Press a button as soon as it can be."""
+        self.until(f"!document.getElementById('{name}').disabled")
+        self.value(f"document.getElementById('{name}').click()")
+
+    def set(self, name: str, value: object, event: str = "input") -> None:
+        self.value(
+            f"(() => {{ const one = document.getElementById('{name}'); one.value = {value!r}; "
+            f"one.dispatchEvent(new Event('{event}')); }})()"
+        )
+
+    def arm(self) -> None:
+        """Arm, again where a busy machine was silent for too long."""
+        if self.text("arm") != "Armed":
+            self.click("arm")
+        self.until(
+            "document.getElementById('arm').innerText === 'Armed' && "
+            "document.getElementById('job').innerText.startsWith('Armed')"
+        )
+
+    def press(self, kind: str, key: str) -> None:
+        self.browser.ask("Input.dispatchKeyEvent", type=kind, key=key, code=key)
+
+
+@pytest.mark.skipif(not CHROMIUM, reason="no Chromium on this machine")
+def test_the_whole_procedure_by_clicks(process, watcher, eventually, tmp_path, ros_domain):
+    lab = process("lab", "--demo", "--no-browser", "--domain", str(ros_domain))
+    watching = watcher(*WHEELS)
+    url = address(lab, eventually)
+    results = tmp_path / "lab_output"
+    with Browser(tmp_path / "profile") as browser:
+        page = Clicks(browser)
+        browser.open(url, 1280)
+        page.until("Number(document.body.dataset.frames) >= 10")
+        for name in ("excite", "identify", "tune", "apply", "step", "keep", "back"):
+            assert page.value(f"document.getElementById('{name}').disabled"), name
+        assert max(map(abs, watching.speeds())) < STANDSTILL
+        # A message is text, whatever it holds.
+        evil = "<img src=x onerror=window.broken=1>"
+        status = DiagnosticStatus(name="front_left/wheel_pid", message=evil, level=b"\1")
+        watching.reports.publish(DiagnosticArray(status=[status]))
+        page.until(f"document.querySelector('#diagnostics').textContent.includes({evil!r})")
+        assert page.value("document.images.length + (window.broken || 0)") == 0
+
+        page.arm()
+        page.set("seconds", 8)
+        page.click("excite")
+        page.until("document.getElementById('recordings').innerText.includes('recording_')")
+        page.click("identify")
+        page.until("document.getElementById('motors').innerText.includes('identified')")
+        folder = next(results.glob("identification_*"))
+        shown = page.text("motors")
+        for estimate in read_identification(folder).values():
+            for quantity in estimate.combinations.values():
+                assert words.state(quantity) in shown
+        page.value("document.getElementById('report').open = true")
+        page.until("document.querySelector('#report iframe')")
+
+        page.click("tune")
+        page.until("document.querySelectorAll('#rows tr').length > 5")
+        gains = next(results.glob("gains_*.yaml"))
+        own = tmp_path / "own.yaml"
+        done = subprocess.run(["tune", folder, "--output", own], capture_output=True, check=False)
+        assert done.returncode == 0, done.stderr
+        assert yaml.safe_load(gains.read_text()) == yaml.safe_load(own.read_text())
+        page.set("share", 0.6)
+        page.until("document.getElementById('yaml').dataset.ms !== ''")
+        slower = float(page.text("share-shown").split()[0])
+        page.set("i", 1e6)
+        page.until("document.getElementById('reason').innerText.includes('unstable')")
+        page.set("share", 1.0)
+        page.until(f"parseFloat(document.getElementById('share-shown').innerText) > {slower}")
+
+        for wheel in WHEELS:
+            page.set("wheel", wheel, "change")
+            page.arm()
+            page.click("apply")
+            page.until("document.getElementById('trial').innerText.startsWith('On trial')")
+            page.click("keep")
+            page.until("document.getElementById('trial').innerText === ''")
+        page.arm()
+        page.value("document.getElementById('pad').focus()")
+        page.press("keyDown", "ArrowUp")
+        eventually(lambda: min(watching.speeds()) > 1.9, 10.0)
+        time.sleep(0.5)
+        assert all(abs(v - 2.0) < 0.1 for v in watching.speeds())  # 0.2 m/s on wheels of 0.1 m
+        stopped = time.time()
+        page.press("keyDown", " ")
+        page.press("keyUp", "ArrowUp")
+        time.sleep(1.0)
+        assert watching.stood_after(stopped) < WITHIN_S
+        assert page.text("arm") == "Arm"
+        assert browser.complaints == []
+    lab.interrupt()
+    lab.wait(30.0)
