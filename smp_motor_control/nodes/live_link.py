@@ -8,7 +8,7 @@ import math
 import time
 from collections.abc import Mapping, Sequence
 from functools import partial
-from typing import Protocol
+from typing import Any
 
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray
@@ -103,26 +103,15 @@ class History:
         return self._newest
 
 
-class Listener(Protocol):
-    """Receiver of a link's events."""
-
-    def on_frame(self, slots: Array, rows: Array) -> None:
-        """Take a batch of samples, shape (slots,) and (slots, wheels, columns)."""
-
-    def on_learned(self, wheel: str, message: MotorParameters) -> None:
-        """Take an estimate of a wheel's motor."""
-
-    def on_halt(self, reason: str) -> None:
-        """Take the reason for which the wheels were stopped."""
-
-    def on_tick(self) -> None:
-        """Act once a period."""
-
-
 class LiveLink:
-    """Streams and commands of the wheels of one robot."""
+    """Streams and commands of the wheels of one robot.
 
-    def __init__(self, client: RobotClient, wheels: Sequence[str], listener: Listener) -> None:
+    The listener has ``on_frame(slots, rows)`` for a batch of samples, shape (slots,) and
+    (slots, wheels, columns), ``on_learned(wheel, message)`` for ``MotorParameters``,
+    ``on_halt(reason)`` once the wheels were stopped, and ``on_tick()`` for every period.
+    """
+
+    def __init__(self, client: RobotClient, wheels: Sequence[str], listener: Any) -> None:
         self._client, self.wheels, self._listener = client, tuple(wheels), listener
         self.history = History(len(wheels))
         self.hardware: dict[str, MotorDescription] = {}
@@ -237,7 +226,9 @@ class LiveLink:
         self._send_setpoints({})
         if self.controlled:
             self.controlled = False
-            request = ChangeState.Request(transition=Transition(id=Transition.TRANSITION_DEACTIVATE))
+            request = ChangeState.Request(
+                transition=Transition(id=Transition.TRANSITION_DEACTIVATE)
+            )
             for switch in self._switches:
                 if switch.service_is_ready():
                     switch.call_async(request)

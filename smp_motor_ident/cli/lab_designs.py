@@ -66,7 +66,7 @@ class _Motors:
 _motors = _Motors({}, {})
 
 
-def design(identified: Path, output: Path, accept_unreliable: bool) -> dict[str, Any]:
+def design_all(identified: Path, output: Path, accept_unreliable: bool) -> dict[str, Any]:
     """Do what ``tune IDENTIFIED --output OUTPUT`` does; return every wheel's design and reason."""
     given = [str(identified), "--output", str(output)]
     arguments = tune.parser().parse_args(

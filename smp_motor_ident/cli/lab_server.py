@@ -18,7 +18,6 @@ import webbrowser
 from collections.abc import Awaitable, Callable
 from typing import Any
 
-import msgspec
 from aiohttp import WSMsgType, web
 
 from smp_motor_control.errors import SmpError
@@ -47,28 +46,22 @@ REPORT_POLICY = "sandbox allow-scripts; frame-ancestors 'self'"  # its scripts r
 
 
 class Page:
-    """One connected page."""
+    """One connected page, with what it is to be sent."""
 
     def __init__(self, socket: web.WebSocketResponse) -> None:
         self.socket = socket
-        self.queue: asyncio.Queue[str | bytes] = asyncio.Queue(QUEUED)
+        self.queue: asyncio.Queue[str | bytes] = asyncio.Queue()
         self.heard_at = time.monotonic()
 
-    def put(self, message: str | bytes) -> None:
-        """Queue a message; a page that cannot keep up is closed."""
-        try:
-            self.queue.put_nowait(message)
-        except asyncio.QueueFull:
-            asyncio.ensure_future(self.socket.close(code=1013, message=b"too slow"))
-
     async def write(self) -> None:
-        """Send what is queued."""
-        while not self.socket.closed:
+        """Send what is queued; leave a page that cannot keep up."""
+        while self.queue.qsize() < QUEUED:
             message = await self.queue.get()
             if isinstance(message, bytes):
                 await self.socket.send_bytes(message)
             else:
                 await self.socket.send_str(message)
+        await self.socket.close(code=1013, message=b"too slow")
 
 
 class Server:
@@ -87,7 +80,9 @@ class Server:
         """Start, and print the address."""
         ready: concurrent.futures.Future[None] = concurrent.futures.Future()
         run = self._serve(ready)
-        self._thread = threading.Thread(target=self._loop.run_until_complete, args=(run,), daemon=True)
+        self._thread = threading.Thread(
+            target=self._loop.run_until_complete, args=(run,), daemon=True
+        )
         self._thread.start()
         ready.result()
         self._laboratory.send = self._send
@@ -156,11 +151,9 @@ class Server:
     def _is_own(self, host: str) -> bool:
         """Return whether a host is this server's: names of others are bound to it by an attack."""
         name, _, port = host.rpartition(":")
-        name = name.strip("[]")
-        own = {self._host, "localhost", "127.0.0.1", "::1"}
-        return port == str(self._port) and (
-            name in own or (not _is_loopback(self._host) and _is_address(name))
-        )
+        known = name in {self._host, "localhost", "127.0.0.1", "[::1]"}
+        open_to_all = not _is_loopback(self._host) and _is_address(name.strip("[]"))
+        return port == str(self._port) and (known or open_to_all)
 
     @web.middleware
     async def _guard(
@@ -175,11 +168,11 @@ class Server:
                 raise web.HTTPForbidden(text="lab: the token was used; open the last one printed\n")
             self._invite()
             answer = web.HTTPFound("/", headers=HEADERS)
-            name, strict = f"lab_{self._port}", "Strict"
-            answer.set_cookie(name, self._session, httponly=True, samesite=strict)
+            cookie = f"lab_{self._port}", self._session
+            answer.set_cookie(*cookie, httponly=True, samesite="Strict")
             raise answer
-        cookie = request.cookies.get(f"lab_{self._port}", "")
-        if not secrets.compare_digest(cookie.encode(), self._session.encode()):
+        known = request.cookies.get(f"lab_{self._port}", "")
+        if not secrets.compare_digest(known.encode(), self._session.encode()):
             raise web.HTTPForbidden(text="lab: open the address that it printed, with its token\n")
         if request.path == "/ws" and request.headers.get("Origin") != f"http://{request.host}":
             raise web.HTTPForbidden(text="lab: another page may not connect\n")
@@ -213,16 +206,18 @@ class Server:
         if self._pages[1:] and self._laboratory.link.armed:
             self._laboratory.link.halt("another page was opened")
         self._driver = self._driver or page
-        for message in self._last.values():
-            page.put(message)
+        for last in self._last.values():
+            page.queue.put_nowait(last)
         self._tell_roles()
-        writer = asyncio.ensure_future(page.write())
+        tasks = {asyncio.ensure_future(page.write())}
         try:
             async for message in socket:
-                if message.type is WSMsgType.TEXT:
-                    await self._take(page, message.data)
+                if message.type is WSMsgType.TEXT:  # a stop waits for no design
+                    tasks.add(task := asyncio.ensure_future(self._take(page, message.data)))
+                    task.add_done_callback(tasks.discard)
         finally:
-            writer.cancel()
+            for task in list(tasks):
+                task.cancel()
             self._pages.remove(page)
             if page is self._driver:
                 self._driver = None
@@ -235,18 +230,16 @@ class Server:
         free, count = self._driver is None, len(self._pages)
         for page in self._pages:
             role = {"drives": page is self._driver, "free": free, "pages": count}
-            page.put(_encode("role", role))
+            page.queue.put_nowait(templates.encode(["role", role]))
 
     async def _take(self, page: Page, text: str) -> None:
         """Take a message of a page; a refused one is answered with the reason."""
         page.heard_at = time.monotonic()
         try:
-            message = json.loads(text)
-            await self._do(page, message)
-        except SmpError as error:
-            page.put(_encode("refused", str(error)))
-        except (ValueError, TypeError, KeyError, AttributeError) as error:
-            page.put(_encode("refused", f"a malformed request: {error!r}"))
+            await self._do(page, json.loads(text))
+        except Exception as error:  # whatever a page sends, the others go on
+            told = str(error) if isinstance(error, SmpError) else f"a wrong request: {error!r}"
+            page.queue.put_nowait(templates.encode(["refused", told]))
 
     async def _do(self, page: Page, message: Any) -> None:
         wanted = message["do"]
@@ -282,24 +275,22 @@ class Server:
             raise ParameterError(f"{', '.join(names)} must be numbers")
         work = lab_designs.judge if by_hand else lab_designs.choose
         made = await asyncio.wrap_future(self._laboratory.designs.submit(work, wheel, *numbers))
-        self._laboratory.candidate(wheel, made)
+        self._laboratory.candidates[wheel] = made
         took = round(1e3 * (time.monotonic() - begun))
-        page.put(_encode("design", {**made, "ms": took, "asked": message.get("asked")}))
+        page.queue.put_nowait(
+            templates.encode(["design", {**made, "ms": took, "asked": message.get("asked")}])
+        )
 
     def _send(self, kind: str, content: Any) -> None:
         """Send to all pages, from any thread."""
         self._loop.call_soon_threadsafe(self._spread, kind, content)
 
     def _spread(self, kind: str, content: Any) -> None:
-        message = content if kind == "frame" else _encode(kind, content)
+        message = content if kind == "frame" else templates.encode([kind, content])
         if isinstance(message, str):
             self._last[kind] = message
         for page in self._pages:
-            page.put(message)
-
-
-def _encode(kind: str, content: Any) -> str:
-    return str(msgspec.json.encode([kind, content], enc_hook=templates.encode_plain).decode())
+            page.queue.put_nowait(message)
 
 
 def _is_address(name: str) -> bool:

@@ -12,6 +12,7 @@ import queue
 import time
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -31,7 +32,6 @@ from smp_motor_ident.report import words
 from smp_motor_ident.report.document import read_identification
 from smp_motor_ident.result import UNITS, Quantity
 
-MAX_AMPLITUDE_SHARE = 1.0  # largest amplitude of an excitation [share of the supply]
 SHORTEST_S, LONGEST_S = 0.5, 300.0  # of an excitation
 TRIAL_S = 2.5  # for which gains on trial are watched
 STEP_AT_S, STEP_LASTS_S = 0.3, 1.2  # begin and length of the step of a trial
@@ -69,9 +69,9 @@ def work(arguments: argparse.Namespace) -> int:
             robot = steps.Robot(processes, client, wheels or WHEELS, folder, ros, bounds)
             client.wait_for_wheels(robot.wheels, timeout=15.0)
             client.refuse_second_reporters(robot.wheels)
-        with Laboratory(robot, designs) as laboratory:
-            with Server(laboratory, arguments.host, arguments.port, not arguments.no_browser):
-                laboratory.run()
+        served = arguments.host, arguments.port, not arguments.no_browser
+        with Laboratory(robot, designs) as laboratory, Server(laboratory, *served):
+            laboratory.run()
     return 0
 
 
@@ -104,7 +104,7 @@ class Laboratory:
         self._models: dict[str, Prediction] = {}
         self._excited: set[str] = set()
         self._before: dict[str, dict[str, Any]] = {}  # parameters of wheels with gains on trial
-        self._candidates: dict[str, dict[str, Any]] = {}  # the design that a page shows, by wheel
+        self.candidates: dict[str, dict[str, Any]] = {}  # the design that a page shows, by wheel
         self._told: tuple[float, str] = (0.0, "")
         self._reason = ""
         self._stack = ExitStack()
@@ -137,8 +137,9 @@ class Laboratory:
             self.state["job"] = name
             try:
                 work()
-            except SmpError as error:
-                self.tell(str(error), "error")
+            except Exception as error:  # the wheels are still to be watched and stopped
+                known = isinstance(error, SmpError)
+                self.tell(str(error) if known else f"the request failed: {error!r}", "error")
             finally:
                 self.state["job"] = self.state["progress"] = ""
                 self.link.rest()
@@ -233,18 +234,16 @@ class Laboratory:
             raise ParameterError(f"busy with {self.state['job']}; wait, or stop it")
         self._jobs.put(jobs[wanted])
 
-    def candidate(self, wheel: str, made: dict[str, Any]) -> None:
-        """Note the design that the driving page shows for a wheel."""
-        self._candidates[wheel] = made
-
     # Jobs, in the main thread -------------------------------------------------------------------
 
     def _wait(self, done: Callable[[], bool], moving: bool = False, name: str = "") -> None:
         """Wait while the streams go on; raise if what moves the wheels was stopped."""
-        while not done():
+        while True:
             interruption.check()
             if moving and not self.link.armed:
                 raise Halted(f"ended before its end: {self._reason}")
+            if done():
+                return
             if name:
                 self.state["progress"] = self.robot.processes.last_line(name)
             self.robot.client.until(done, 0.1)
@@ -273,44 +272,37 @@ class Laboratory:
         supply = min(self.state["supply"].values(), default=12.0)
         if not wheels:
             raise ParameterError("no wheel is chosen; choose one")
-        if not 0.0 < amplitude <= MAX_AMPLITUDE_SHARE * supply:
+        if not 0.0 < amplitude <= supply:
             raise ParameterError(f"the amplitude is {amplitude:g} V; the supply is {supply:g} V")
         if not SHORTEST_S <= duration <= LONGEST_S:
             raise ParameterError(
                 f"the excitation takes {duration:g} s; allowed are {SHORTEST_S:g} to {LONGEST_S:g}"
             )
         self._activate(False)
-        processes, ros = self.robot.processes, self.robot.ros_arguments
+        processes = self.robot.processes
         processes.stop("identifier")
         self._models.clear()
         self.state["motors"] = {}
         listed = f"wheels:=[{', '.join(wheels)}]"
         window = min(max(duration, 5.0), 60.0)
         processes.start(
-            "identifier", "identifier", *ros, "--ros-args", "-p", listed, "-p", "period:=1.0",
-            "-p", "share:=0.2", "-p", f"window:={window}", priority=BACKGROUND,
+            "identifier", "identifier", *self.robot.ros_arguments, "--ros-args", "-p", listed,
+            "-p", "period:=1.0", "-p", "share:=0.2", "-p", f"window:={window}", priority=BACKGROUND,
         )  # fmt: skip
         name = f"recording_{next(self._numbers)}"
+
+        def has_ended() -> bool:
+            since = time.monotonic() - begun
+            self.state["progress"] = f"{min(since, duration):.0f} of {duration:g} s"
+            return bool(processes.has_ended("excite"))
+
         try:
             steps.record(self.robot, name)
-            parameters = {
-                "signal": asked["signal"], "wheels": f"[{', '.join(wheels)}]",
-                "wheel_names": f"[{', '.join(self.robot.wheels)}]", "amplitude": amplitude,
-                "duration": duration, **self.robot.bounds,
-            }  # fmt: skip
-            given = [a for n, v in parameters.items() for a in ("-p", f"{n}:={v}")]
-            if not self.link.armed:
-                raise Halted(f"nothing moved: {self._reason}")
-            processes.start("excite", "excite", *ros, "--ros-args", *given)
+            self._wait(lambda: True, moving=True)
             begun = time.monotonic()
-
-            def ended() -> bool:
-                since = time.monotonic() - begun
-                self.state["progress"] = f"{min(since, duration):.0f} of {duration:g} s"
-                return bool(processes.has_ended("excite"))
-
-            self._wait(ended, moving=True)
-            processes.wait("excite", steps.TIMEOUT_S)
+            plan = [steps.Excitation(str(asked["signal"]), duration, amplitude)]
+            moved = replace(self.robot, wheels=tuple(wheels))
+            steps.excite(moved, plan, lambda: self._wait(has_ended, moving=True))
         finally:
             processes.stop("excite", "record")
         self.state["recordings"] = [*self.state["recordings"], name]
@@ -346,10 +338,10 @@ class Laboratory:
             raise ParameterError("no motor is identified yet; identify the motors first")
         name = self.state["identified"]
         gains = self.folder / f"gains_{next(self._numbers)}.yaml"
-        asked = self.designs.submit(lab_designs.design, self.folder / name, gains, accept)
+        asked = self.designs.submit(lab_designs.design_all, self.folder / name, gains, accept)
         self._wait(asked.done)
         found = asked.result()
-        self._candidates = dict(found["designs"])
+        self.candidates = dict(found["designs"])
         self.send("designs", found)
         self.state["designed"] = {"name": gains.name, "reason": found["reason"]}
         self.tell(f"Designed gains for {', '.join(found['designs'])}: {gains.name}.")
@@ -358,7 +350,7 @@ class Laboratory:
         """Set the gains that the page shows, and restore the old ones if the wheel misbehaves."""
         from smp_motor_control.nodes.gain_trial import try_gains
 
-        made = self._candidates.get(wheel, {})
+        made = self.candidates.get(wheel, {})
         if "parameters" not in made:
             raise ParameterError(f"{wheel or 'no wheel'} has no design to apply; design one first")
         client, new = self.robot.client, dict(made["parameters"])
@@ -379,7 +371,7 @@ class Laboratory:
         self._show_step(wheel)
 
     def _step(self, wheel: str) -> None:
-        if wheel not in self._candidates:
+        if wheel not in self.candidates:
             raise ParameterError(f"{wheel or 'no wheel'} has no design; its step would be unknown")
         self._wait(self.link.is_body_idle, moving=True)
         self._activate(True)
@@ -390,7 +382,7 @@ class Laboratory:
 
     def _begin_step(self, wheel: str) -> None:
         self._stepped_at = self.link.history.now
-        change = float(self._candidates[wheel]["change"])
+        change = float(self.candidates[wheel]["change"])
         plan = [(0.0, 0.0), (STEP_AT_S, change), (STEP_AT_S + STEP_LASTS_S, 0.0)]
         self.link.follow({wheel: plan})
 
@@ -398,15 +390,16 @@ class Laboratory:
         """Send the measured answer to the step, from the instant of its set-point [s]."""
         slots, rows = self.link.history.since(self._stepped_at)
         mine = rows[:, self.robot.wheels.index(wheel)]
-        change = float(self._candidates[wheel]["change"])
+        change = float(self.candidates[wheel]["change"])
         asked = np.flatnonzero(np.abs(mine[:, 3] - change) < 1e-6 * abs(change))
         if asked.size == 0:
             raise Halted(f"{wheel} reported no set-point of {change:.3g} rad/s")
-        shown = slice(asked[0], asked[-1] + 1)
-        time_s = (slots[shown] - slots[asked[0]]) * self._slot_s
-        known = np.isfinite(mine[shown, self._speed])
-        speed = mine[shown, self._speed][known]
-        self.send("step", {"wheel": wheel, "time": time_s[known].tolist(), "speed": speed.tolist()})
+        shown = np.arange(asked[0], asked[-1] + 1)
+        shown = shown[np.isfinite(mine[shown, self._speed])]
+        milliseconds = 1e3 * self._slot_s * (slots[shown] - slots[asked[0]])
+        on = self.candidates[wheel]["charts"]["tuning-step"][0]
+        speed = np.interp(on, milliseconds, mine[shown, self._speed], right=np.nan)
+        self.send("step", {"wheel": wheel, "speed": speed})
 
     def _decide(self, keep: bool) -> None:
         if not self._before:

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Steps from a running robot to tuned wheels, shared by demo and commission."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -69,8 +69,10 @@ def record(robot: Robot, name: str, *shown: str) -> Path:
     return bag
 
 
-def excite(robot: Robot, plan: Sequence[Excitation]) -> None:
-    """Move all wheels by one signal after the other."""
+def excite(
+    robot: Robot, plan: Sequence[Excitation], wait: Callable[[], None] = lambda: None
+) -> None:
+    """Move all wheels by one signal after the other; ``wait`` may wait for the end in its way."""
     for part in plan:
         parameters: dict[str, object] = {
             "signal": part.signal, "wheels": f"[{', '.join(robot.wheels)}]",
@@ -80,6 +82,7 @@ def excite(robot: Robot, plan: Sequence[Excitation]) -> None:
             parameters["lowest"], parameters["highest"] = part.band
         arguments = [a for n, v in parameters.items() for a in ("-p", f"{n}:={v}")]
         robot.processes.start("excite", "excite", *robot.ros_arguments, "--ros-args", *arguments)
+        wait()
         robot.processes.wait("excite", part.duration + TIMEOUT_S)
 
 

@@ -66,7 +66,7 @@
   const from = time => { let low = 0, high = times.length; while (low < high) { const middle = (low + high) >> 1; if (times[middle] < time) low = middle + 1; else high = middle; } return low; };
 
   const SHOWN = {
-    speed: [["set-point", "setpoint", "muted", 1, [5, 3]], ["reference", "reference", "voltage", 1], ["speed", "speed", "measured", 1.5], ["predicted", "prediction", "simulated", 1.5]],
+    speed: [["set-point", "setpoint", "ink", 1, [5, 3]], ["reference", "reference", "muted", 1], ["speed", "speed", "measured", 1.5], ["predicted", "prediction", "simulated", 1.5]],
     voltage: [["voltage [V]", "voltage", "voltage", 1.5], ["current [A]", "current", "simulated", 1]],
   };
   const plots = [];
@@ -112,10 +112,10 @@
   }
   function tell() {
     for (const wheel of state.wheels) {
-      const panel = part(wheel), now = name => before(column(wheel, name), pointed == null ? times.length - 1 : from(pointed)), text = (v, unit, digits) => v == null ? "–" : `${v.toFixed(digits)} ${unit}`;
+      const panel = part(wheel), now = name => before(column(wheel, name), pointed == null ? times.length - 1 : from(pointed)), text = (v, unit) => v == null ? "–" : `${(Math.round(100 * v) / 100 + 0).toFixed(2)} ${unit}`;
       const target = now("setpoint"), speed = now("speed");
       for (const [name, value, unit] of [["speed", speed, "rad/s"], ["setpoint", target, "rad/s"], ["error", target == null || speed == null ? null : target - speed, "rad/s"], ["voltage", now("voltage"), "V"], ["current", now("current"), "A"]])
-        panel.querySelector(`.${name}`).textContent = text(value, unit, 2);
+        panel.querySelector(`.${name}`).textContent = text(value, unit);
     }
   }
   function redraw() {
@@ -220,6 +220,7 @@
     measured = {};
     part("tune-charts").replaceChildren();
     for (const chart of content.charts) {
+      chart.curves[0].name = "designed";
       if (chart.name === "tuning-step") chart.curves.push({name: "measured", color: "simulated", kind: "line", width: 1.5, low: null, high: null, y: null});
       const figure = make("figure", "", "chart"), place = make("div", "", "live");
       Object.assign(place, {role: "img", ariaLabel: chart.title});
@@ -233,7 +234,7 @@
   }
   function showDesign(made) {
     waiting = false;
-    if (made.wheel && made.asked != null) designs[made.wheel] = made;
+    if (made.asked != null) { designs[made.wheel] = made; measured[made.wheel] = null; }
     if (pending) { const next = pending; pending = null; request(next); }
     if (made.wheel !== part("wheel").value) return;
     part("reason").textContent = made.reason || "";
@@ -245,21 +246,14 @@
     part("margin-shown").textContent = made.phase_margin ? `${made.phase_margin.toFixed(0)}°` : "";
     for (const [name, arrays] of Object.entries(made.charts || {})) {
       const data = arrays.map(unpack);
-      if (name === "tuning-step") data.push(data[0].map(t => at(measured[made.wheel], t / 1000)));
+      if (name === "tuning-step") data.push(measured[made.wheel] || data[0].map(() => null));
       figures[name].setData(data);
     }
     enable();
   }
-  function at(step, time) {
-    if (!step || time > step.time.at(-1)) return null;
-    const k = step.time.findIndex(t => t >= time);
-    if (k < 1) return step.speed[0];
-    const share = (time - step.time[k - 1]) / (step.time[k] - step.time[k - 1]);
-    return step.speed[k - 1] + share * (step.speed[k] - step.speed[k - 1]);
-  }
   function showStep(step) {
-    measured[step.wheel] = step;
-    if (designs[step.wheel]) showDesign({...designs[step.wheel]});
+    measured[step.wheel] = unpack(step.speed);
+    showDesign({...designs[step.wheel], asked: null});
   }
   function request(values) {
     if (waiting) { pending = values; return; }
@@ -269,7 +263,7 @@
   }
   for (const id of ["share", "phase_margin"]) part(id).addEventListener("input", () => request({share: Number(part("share").value), phase_margin: Number(part("phase_margin").value)}));
   for (const id of ["p", "i", "d"]) part(id).addEventListener("input", () => request(Object.fromEntries(["p", "i", "d"].map(name => [name, part(name).valueAsNumber]))));
-  part("wheel").addEventListener("change", () => { if (designs[part("wheel").value]) showDesign({...designs[part("wheel").value]}); });
+  part("wheel").addEventListener("change", () => { if (designs[part("wheel").value]) showDesign({...designs[part("wheel").value], asked: null}); });
 
   // Driving -------------------------------------------------------------------------------------------
 

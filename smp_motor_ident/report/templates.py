@@ -68,9 +68,13 @@ def text(name: str) -> str:
 
 def script_data(content: Any) -> Markup:
     """Return data for a script element, which nothing in it may end."""
-    return Markup(msgspec.json.encode(content, enc_hook=encode_plain).decode().replace("<", "\\u003c"))
+    return Markup(encode(content).replace("<", "\\u003c"))
 
 
-def encode_plain(value: Any) -> str | float:
-    """Return an array in base64, any other number as it is."""
+def encode(content: Any) -> str:
+    """Return JSON, with arrays in base64."""
+    return msgspec.json.encode(content, enc_hook=_plain).decode()
+
+
+def _plain(value: Any) -> str | float:
     return packed(value) if isinstance(value, np.ndarray) else float(value)

@@ -266,7 +266,7 @@ def find_last_exit(time: Array, outside: NDArray[np.bool_]) -> Array:
     """
     inside = np.argmax(outside[..., ::-1], axis=-1)
     begin = np.where(outside.any(axis=-1), time.size - inside, 0)
-    return np.append(time, math.nan)[begin]
+    return np.asarray(np.append(time, math.nan)[begin], dtype=np.float64)
 
 
 def settling_time(time: Array, answer: Array, tolerance: float = SETTLING_BAND.value) -> float:
