@@ -1,15 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Designs for the page of ``lab``, computed in a process of their own.
-
-The functions at the end run in that process, which keeps the motors and their designs.
-"""
+"""Designs for the page of ``lab``, in a process of their own that keeps motors and designs."""
 
 import math
-import multiprocessing
 import os
-from collections.abc import Callable
-from concurrent.futures import Future, ProcessPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -31,39 +25,14 @@ from smp_motor_ident.tune.writing import parameters
 NICENESS = 5  # of the process that designs
 
 
-class Designs:
-    """The process that designs, for a ``with`` block."""
-
-    def __enter__(self) -> "Designs":
-        """Start the process, which loads its modules meanwhile."""
-        spawn = multiprocessing.get_context("spawn")
-        self._pool = ProcessPoolExecutor(1, mp_context=spawn, initializer=_begin)
-        self._pool.submit(int)
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        """End the process."""
-        self._pool.shutdown(cancel_futures=True)
-
-    def submit(self, work: Callable[..., Any], *given: Any) -> Future[Any]:
-        """Let the process do some work."""
-        return self._pool.submit(work, *given)
-
-
-def _begin() -> None:
+def begin() -> None:
+    """Begin the process that designs: it ends with its parent, and the robot goes first."""
     end_with_parent()
-    os.nice(NICENESS)  # the robot goes first
+    os.nice(NICENESS)
 
 
-@dataclass
-class _Motors:
-    """Motors and the designs of ``tune``."""
-
-    estimates: dict[str, Estimate]
-    own: dict[str, Design]
-
-
-_motors = _Motors({}, {})
+_estimates: dict[str, Estimate] = {}
+_own: dict[str, Design] = {}  # the designs of ``tune``
 
 
 def design_all(identified: Path, output: Path, accept_unreliable: bool) -> dict[str, Any]:
@@ -76,7 +45,8 @@ def design_all(identified: Path, output: Path, accept_unreliable: bool) -> dict[
     wheels, reasons = tuning.design_together(estimates, arguments)
     files = [output, output.with_suffix(".json"), output.with_suffix(".svg")]
     tuning.write(files, wheels, estimates, arguments, reasons)
-    _motors.estimates, _motors.own = estimates, dict(wheels.designs)
+    _estimates.update(estimates)
+    _own.update(wheels.designs)
     margin = tuning_page.DEFAULT_PHASE_MARGIN
     choices = {
         wheel: Choice(one.margins.crossover, margin, one, curves(estimates[wheel], one))
@@ -92,15 +62,14 @@ def design_all(identified: Path, output: Path, accept_unreliable: bool) -> dict[
 
 def choose(wheel: str, share: float, phase_margin: float) -> dict[str, Any]:
     """Design one wheel for a share of its largest bandwidth and a phase margin [deg]."""
-    own = _motors.own[wheel]
+    estimate, own = _estimates[wheel], _own[wheel]
     bandwidth = share * own.margins.crossover
-    asked = _motors.estimates[wheel], own.loop, bandwidth, phase_margin, own
-    return _describe(wheel, tuning_page.choose(*asked))
+    return _describe(wheel, tuning_page.choose(estimate, own.loop, bandwidth, phase_margin, own))
 
 
 def judge(wheel: str, p: float, i: float, d: float) -> dict[str, Any]:
     """Return what gains [V per wheel rad/s] that were set by hand do."""
-    estimate, own = _motors.estimates[wheel], _motors.own[wheel]
+    estimate, own = _estimates[wheel], _own[wheel]
     ratio = own.loop.gear_ratio
     feedback = Feedback(p / ratio, i / ratio, d / ratio, own.feedback.filter_time)
     given = {"samples": tuning_page.BAND_DRAWS, "together": own.together}

@@ -7,10 +7,10 @@ The page that drives is heard every 0.1 s, or the wheels stop.
 
 import asyncio
 import concurrent.futures
-import ipaddress
 import json
 import math
 import os
+import re
 import secrets
 import threading
 import time
@@ -31,15 +31,10 @@ QUEUED = 60  # messages that wait for a slow page before it is closed
 MAX_MESSAGE = 10_000  # length of a request [bytes]
 WATCH_S, LOST_S = 0.03, 0.3  # interval of watching, and silence that stops the wheels
 ABANDONED_S = 2.0  # silence after which another page may take the place of the one that drives
-HEADERS = {
-    "Referrer-Policy": "no-referrer",
-    "X-Content-Type-Options": "nosniff",
-    "Cache-Control": "no-store",
-}
+HEADERS = {"Referrer-Policy": "no-referrer", "Cache-Control": "no-store"}
 POLICY = (
     "default-src 'none'; script-src 'nonce-{0}'; style-src 'nonce-{0}'; connect-src 'self'; "
-    "worker-src blob:; "
-    "img-src data: blob:; frame-src 'self'; base-uri 'none'; form-action 'none'; "
+    "worker-src blob:; frame-src 'self'; base-uri 'none'; form-action 'none'; "
     "frame-ancestors 'none'"
 )
 REPORT_POLICY = "sandbox allow-scripts; frame-ancestors 'self'"  # its scripts reach nothing here
@@ -149,11 +144,11 @@ class Server:
         print(f"lab: open {self._address()}", flush=True)
 
     def _is_own(self, host: str) -> bool:
-        """Return whether a host is this server's: names of others are bound to it by an attack."""
+        """Return whether a host is this server's, and no name that an attacker bound to it."""
         name, _, port = host.rpartition(":")
+        address = not _is_loopback(self._host) and re.fullmatch(r"[\d.]+|\[[\da-f:]+\]", name)
         known = name in {self._host, "localhost", "127.0.0.1", "[::1]"}
-        open_to_all = not _is_loopback(self._host) and _is_address(name.strip("[]"))
-        return port == str(self._port) and (known or open_to_all)
+        return port == str(self._port) and (known or bool(address))
 
     @web.middleware
     async def _guard(
@@ -182,8 +177,8 @@ class Server:
 
     async def _page(self, request: web.Request) -> web.Response:
         nonce = secrets.token_urlsafe(16)
-        text = templates.lab_page(nonce, self._laboratory.state["wheels"])
         headers = {**HEADERS, "Content-Security-Policy": POLICY.format(nonce)}
+        text = templates.lab_page(nonce, self._laboratory.state["wheels"])
         return web.Response(text=text, content_type="text/html", headers=headers)
 
     async def _result(self, request: web.Request) -> web.StreamResponse:
@@ -227,13 +222,12 @@ class Server:
         return socket
 
     def _tell_roles(self) -> None:
-        free, count = self._driver is None, len(self._pages)
         for page in self._pages:
-            role = {"drives": page is self._driver, "free": free, "pages": count}
+            role = {"drives": page is self._driver, "pages": len(self._pages)}
             page.queue.put_nowait(templates.encode(["role", role]))
 
     async def _take(self, page: Page, text: str) -> None:
-        """Take a message of a page; a refused one is answered with the reason."""
+        """Do what a page asks; a refusal is answered with its reason."""
         page.heard_at = time.monotonic()
         try:
             await self._do(page, json.loads(text))
@@ -242,25 +236,20 @@ class Server:
             page.queue.put_nowait(templates.encode(["refused", told]))
 
     async def _do(self, page: Page, message: Any) -> None:
-        wanted = message["do"]
-        if wanted == "beat":
-            return
+        wanted, driver, link = message["do"], self._driver, self._laboratory.link
         if wanted == "stop":  # which every page may
-            self._laboratory.link.halt("stop was pressed")
-            return
-        if wanted == "take":
-            driver = self._driver
+            link.halt("stop was pressed")
+        elif wanted == "take":
             if driver is not None and time.monotonic() - driver.heard_at < ABANDONED_S:
                 raise ParameterError("another page drives; close it first")
             self._driver = page
-            self._laboratory.link.halt("another page took over")
+            link.halt("another page took over")
             self._tell_roles()
-            return
-        if page is not self._driver:
+        elif wanted != "beat" and page is not driver:
             raise ParameterError("this page watches; another one drives")
-        if wanted == "design":
+        elif wanted == "design":
             await self._design(page, message)
-        else:
+        elif wanted != "beat":
             self._laboratory.ask(message)
 
     async def _design(self, page: Page, message: dict[str, Any]) -> None:
@@ -273,7 +262,7 @@ class Server:
         numbers = [float(message[name]) for name in names]
         if not all(map(math.isfinite, numbers)):
             raise ParameterError(f"{', '.join(names)} must be numbers")
-        work = lab_designs.judge if by_hand else lab_designs.choose
+        work: Callable[..., Any] = lab_designs.judge if by_hand else lab_designs.choose
         made = await asyncio.wrap_future(self._laboratory.designs.submit(work, wheel, *numbers))
         self._laboratory.candidates[wheel] = made
         took = round(1e3 * (time.monotonic() - begun))
@@ -293,13 +282,5 @@ class Server:
             page.queue.put_nowait(message)
 
 
-def _is_address(name: str) -> bool:
-    try:
-        ipaddress.ip_address(name)
-    except ValueError:
-        return False
-    return True
-
-
 def _is_loopback(host: str) -> bool:
-    return host == "localhost" or (_is_address(host) and ipaddress.ip_address(host).is_loopback)
+    return host in ("localhost", "::1") or host.startswith("127.")

@@ -7,10 +7,12 @@ The main thread waits for the robot and works; the server of the page has a thre
 import argparse
 import itertools
 import math
+import multiprocessing
 import os
 import queue
 import time
 from collections.abc import Callable, Mapping
+from concurrent.futures import ProcessPoolExecutor
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
@@ -26,18 +28,19 @@ from smp_motor_control.motor import Motor, MotorParameters
 from smp_motor_control.motor.file import PAPER_MOTORS, find_config
 from smp_motor_control.nodes import loopback
 from smp_motor_ident.cli import commissioning, demonstration, interruption, lab, lab_designs, steps
-from smp_motor_ident.cli.processes import Processes, connect, free_domain
+from smp_motor_ident.cli.processes import ProcessError, Processes, connect, free_domain
 from smp_motor_ident.errors import ParameterError
 from smp_motor_ident.report import words
 from smp_motor_ident.report.document import read_identification
 from smp_motor_ident.result import UNITS, Quantity
 
-SHORTEST_S, LONGEST_S = 0.5, 300.0  # of an excitation
+LONGEST_S = 300.0  # of an excitation
 TRIAL_S = 2.5  # for which gains on trial are watched
 STEP_AT_S, STEP_LASTS_S = 0.3, 1.2  # begin and length of the step of a trial
 STATE_S = 0.1  # shortest time between two messages about the state
 BACKGROUND = -10  # priority of what computes beside the robot
 MESSAGES = 3  # that a page shows of a kind
+SPAWN = multiprocessing.get_context("spawn")
 COMBINATIONS = ("dc_gain", "time_constant", "time_constant_product", "static_voltage")
 
 
@@ -56,8 +59,9 @@ def work(arguments: argparse.Namespace) -> int:
     with (
         connect(lab.NAME, ros) as client,
         Processes(folder / "logs") as processes,
-        lab_designs.Designs() as designs,
+        ProcessPoolExecutor(1, SPAWN, initializer=lab_designs.begin) as designs,
     ):
+        designs.submit(int)  # it loads its modules meanwhile
         if arguments.demo:
             robot = steps.Robot(processes, client, WHEELS, folder, ros, bounds)
             motors = Path(arguments.motors) if arguments.motors else find_config(PAPER_MOTORS)
@@ -75,16 +79,10 @@ def work(arguments: argparse.Namespace) -> int:
     return 0
 
 
-class Halted(SmpError):
-    """The wheels were stopped while something moved them."""
-
-    exit_code = 1
-
-
 class Laboratory:
     """One robot, what is being done with it, and what its pages show."""
 
-    def __init__(self, robot: steps.Robot, designs: lab_designs.Designs) -> None:
+    def __init__(self, robot: steps.Robot, designs: ProcessPoolExecutor) -> None:
         from smp_motor_control.nodes.live_link import COLUMNS, SLOT_S, LiveLink
 
         self.robot, self.designs = robot, designs
@@ -122,8 +120,8 @@ class Laboratory:
         self.robot.processes.stop("excite", "record", "identifier", "identify")
         if self._taken:
             self._activate(False)
-            pending = client.pending_restore
-            client.set_pending_restore(**{n: v for n, v in pending.items() if n != "halt"})
+            self._taken = False
+            self._note()
         self._stack.close()
 
     def run(self) -> None:
@@ -155,7 +153,8 @@ class Laboratory:
         """Send a batch of samples as rows of float32: slot, then the columns of every wheel."""
         for wheel, model in list(self._models.items()):
             k = self.robot.wheels.index(wheel)
-            rows[:, k, self._prediction] = model.follow(slots * self._slot_s, rows[:, k, 0])
+            voltage, speed = rows[:, k, 0], rows[:, k, self._speed]
+            rows[:, k, self._prediction] = model.follow(slots * self._slot_s, voltage, speed)
         table = np.column_stack([slots - self.link.history.origin, rows.reshape(slots.size, -1)])
         self.send("frame", table.astype("<f4").tobytes())
 
@@ -174,11 +173,7 @@ class Laboratory:
         hardware = self.link.hardware.get(wheel)
         model = {n: float(found[n].value or 0.0) for n in COMBINATIONS if n in found}
         if hardware is not None and {"dc_gain", "time_constant"} <= set(model):
-            _, rows_now = self.link.history.since(self.link.history.now - 20)
-            speeds = rows_now[:, self.robot.wheels.index(wheel), self._speed]
-            known = speeds[np.isfinite(speeds)]
-            speed = float(known[-1]) if known.size else 0.0
-            self._models[wheel] = Prediction(model, hardware.gear_ratio, speed)
+            self._models[wheel] = Prediction(model, hardware.gear_ratio)
 
     def on_halt(self, reason: str) -> None:
         """End an excitation at once, and verify that the controllers are inactive."""
@@ -241,7 +236,7 @@ class Laboratory:
         while True:
             interruption.check()
             if moving and not self.link.armed:
-                raise Halted(f"ended before its end: {self._reason}")
+                raise ProcessError(f"ended before its end: {self._reason}")
             if done():
                 return
             if name:
@@ -255,9 +250,8 @@ class Laboratory:
                 self.tell(f"No wheel_pid runs for {', '.join(missing)}: one is started.")
                 self.robot.start_controllers(missing)
             self._stack.enter_context(client.paused(self.robot.wheels))
-            controllers = [controller_of(wheel) for wheel in self.robot.wheels]
-            client.set_pending_restore(**client.pending_restore, halt=controllers)
             self._taken = True
+            self._note()
         link.watched_at, link.armed = time.monotonic(), True
         self._activate(True)
 
@@ -269,15 +263,12 @@ class Laboratory:
     def _excite(self, asked: Mapping[str, Any]) -> None:
         wheels = [w for w in self.robot.wheels if w in asked["wheels"]]
         amplitude, duration = float(asked["amplitude"]), float(asked["seconds"])
-        supply = min(self.state["supply"].values(), default=12.0)
         if not wheels:
             raise ParameterError("no wheel is chosen; choose one")
-        if not 0.0 < amplitude <= supply:
-            raise ParameterError(f"the amplitude is {amplitude:g} V; the supply is {supply:g} V")
-        if not SHORTEST_S <= duration <= LONGEST_S:
-            raise ParameterError(
-                f"the excitation takes {duration:g} s; allowed are {SHORTEST_S:g} to {LONGEST_S:g}"
-            )
+        if not duration <= LONGEST_S:
+            raise ParameterError(f"the length is {duration:g} s; it is at most {LONGEST_S:g} s")
+        supply = min(self.state["supply"].values(), default=12.0)
+        bounds = {**self.robot.bounds, "max_voltage": supply}
         self._activate(False)
         processes = self.robot.processes
         processes.stop("identifier")
@@ -301,7 +292,7 @@ class Laboratory:
             self._wait(lambda: True, moving=True)
             begun = time.monotonic()
             plan = [steps.Excitation(str(asked["signal"]), duration, amplitude)]
-            moved = replace(self.robot, wheels=tuple(wheels))
+            moved = replace(self.robot, wheels=tuple(wheels), bounds=bounds)
             steps.excite(moved, plan, lambda: self._wait(has_ended, moving=True))
         finally:
             processes.stop("excite", "record")
@@ -364,9 +355,9 @@ class Laboratory:
             self.state["supply"].get(wheel, 12.0), self.tell, lambda: self._begin_step(wheel),
         )  # fmt: skip
         if outcome.reason:
-            raise Halted(f"{outcome.reason}; its old gains are restored")
+            raise ProcessError(f"{outcome.reason}; its old gains are restored")
         self._before.setdefault(wheel, old)
-        self._note_trials()
+        self._note()
         self.state["trial"] = {"wheel": wheel, "wheels": sorted(self._before)}
         self._show_step(wheel)
 
@@ -393,7 +384,7 @@ class Laboratory:
         change = float(self.candidates[wheel]["change"])
         asked = np.flatnonzero(np.abs(mine[:, 3] - change) < 1e-6 * abs(change))
         if asked.size == 0:
-            raise Halted(f"{wheel} reported no set-point of {change:.3g} rad/s")
+            raise ProcessError(f"{wheel} reported no set-point of {change:.3g} rad/s")
         shown = np.arange(asked[0], asked[-1] + 1)
         shown = shown[np.isfinite(mine[shown, self._speed])]
         milliseconds = 1e3 * self._slot_s * (slots[shown] - slots[asked[0]])
@@ -412,31 +403,35 @@ class Laboratory:
         self.tell(f"{done}: {'gains kept' if keep else 'old gains restored'}.")
         self._before.clear()
         self.state["trial"] = None
-        self._note_trials()
+        self._note()
 
-    def _note_trials(self) -> None:
-        """Let the guard restore the old gains if this process dies."""
-        pending = {n: v for n, v in self.robot.client.pending_restore.items() if n != "gains"}
-        if self._before:
-            pending["gains"] = {controller_of(w): old for w, old in self._before.items()}
+    def _note(self) -> None:
+        """Let the guard halt the wheels and restore the old gains if this process dies."""
+        pending = {"active": self.robot.client.pending_restore.get("active", ())}
+        pending["halt"] = [controller_of(w) for w in self.robot.wheels if self._taken]
+        pending["gains"] = {controller_of(w): old for w, old in self._before.items()}
         self.robot.client.set_pending_restore(**pending)
 
 
 class Prediction:
     """Speed of an estimated motor under the recorded voltage."""
 
-    def __init__(self, model: Mapping[str, float], gear_ratio: float, speed: float) -> None:
+    def __init__(self, model: Mapping[str, float], gear_ratio: float) -> None:
         self._ratio = gear_ratio
-        self._motor = Motor(MotorParameters.from_combinations(**model), speed=speed * gear_ratio)
+        self._motor = Motor(MotorParameters.from_combinations(**model))
         self._time = math.nan
 
-    def follow(self, time: Array, voltage: Array) -> list[float]:
-        """Return the wheel's speed [rad/s] at instants [s] that end intervals of a voltage [V]."""
+    def follow(self, time: Array, voltage: Array, speed: Array) -> list[float]:
+        """Return the wheel's speed [rad/s] at instants [s] that end intervals of a voltage [V].
+
+        The first measured ``speed`` is where it begins.
+        """
         speeds = []
-        for now, volts in zip(time.tolist(), voltage.tolist()):
-            if math.isfinite(volts):
-                step = min(now - self._time, 1.0) if math.isfinite(self._time) else 0.0
-                self._motor.step(volts, max(step, 0.0))
+        for now, volts, measured in zip(time.tolist(), voltage.tolist(), speed.tolist()):
+            if math.isnan(self._time) and math.isfinite(measured):
+                self._motor.speed, self._time = measured * self._ratio, now
+            if math.isfinite(volts) and now > self._time:
+                self._motor.step(volts, min(now - self._time, 1.0))
                 self._time = now
             speeds.append(self._motor.speed / self._ratio)
         return speeds

@@ -6,9 +6,9 @@
   const make = (tag, text = "", kind = "") => Object.assign(document.createElement(tag), {textContent: text, className: kind});
   const row = (...cells) => { const one = make("tr"); one.append(...cells.map(cell => cell instanceof Node ? cell : make("td", cell))); return one; };
   const label = wheel => { const text = wheel.replaceAll("_", " "); return text[0].toUpperCase() + text.slice(1); };
-  const KEPT = 60, PLOT = {speed: 200, voltage: 160};
+  const KEPT = 60, HEIGHT = {speed: 200, voltage: 160};
   let state = {wheels: [], columns: [], slot: 0.005, messages: [], supply: {}, diagnostics: [], recordings: [], motors: {}, identified: ""};
-  let role = {drives: false, free: false, pages: 1};
+  let role = {drives: false, pages: 1};
   let designs = {}, pending = null, waiting = false, counter = 0;
 
   // The connection, which a worker keeps: drawing does not delay its beats, a page that hangs ends them --
@@ -66,38 +66,28 @@
   const from = time => { let low = 0, high = times.length; while (low < high) { const middle = (low + high) >> 1; if (times[middle] < time) low = middle + 1; else high = middle; } return low; };
 
   const SHOWN = {
-    speed: [["set-point", "setpoint", "ink", 1, [5, 3]], ["reference", "reference", "muted", 1], ["speed", "speed", "measured", 1.5], ["predicted", "prediction", "simulated", 1.5]],
-    voltage: [["voltage [V]", "voltage", "voltage", 1.5], ["current [A]", "current", "simulated", 1]],
+    speed: [["setpoint", "ink"], ["reference", "muted"], ["speed", "measured"], ["prediction", "simulated"]],
+    voltage: [["voltage", "voltage"], ["current", "simulated"]],
   };
   const plots = [];
   const nice = size => { const unit = 10 ** Math.floor(Math.log10(size)); return [1, 2, 5, 10].find(k => k * unit >= size) * unit; };
 
   function plot(place, wheel, kind) {
-    const axis = {stroke: () => color("muted"), grid: {stroke: () => color("grid"), width: 1}, ticks: {show: false}};
-    const series = SHOWN[kind].map(([name, , shade, width, dash]) => ({label: name, stroke: () => color(shade), width, dash, spanGaps: true, points: {show: false}, scale: name.endsWith("[A]") ? "A" : "y"}));
-    const limit = () => (kind === "voltage" ? state.supply[wheel] : 0) || 0;
-    const ends = u => { const most = kind === "voltage" && limit() ? 1.08 * limit() : Math.max(1, u.most || 0); return [-most, most]; };
-    const lines = u => {
-      if (!limit()) return;
-      u.ctx.save(); u.ctx.strokeStyle = color("bad"); u.ctx.setLineDash([4, 4]);
-      for (const level of [limit(), -limit()]) { const y = u.valToPos(level, "y", true); u.ctx.beginPath(); u.ctx.moveTo(u.bbox.left, y); u.ctx.lineTo(u.bbox.left + u.bbox.width, y); u.ctx.stroke(); }
-      u.ctx.restore();
-    };
-    const axes = [{...axis, size: 28, values: (u, marks) => marks.map(v => `${written(v)} s`)}, {...axis, size: 50, label: kind === "speed" ? "rad/s" : "V", labelSize: 18}];
-    if (kind === "voltage") axes.push({...axis, scale: "A", side: 1, size: 46, label: "A", labelSize: 18, grid: {show: false}});
-    const u = new uPlot({
-      width: place.clientWidth || 280, height: PLOT[kind], axes, series: [{}, ...series], legend: {show: false},
-      scales: {x: {time: false}, y: {range: ends}, A: {range: () => { const most = Math.max(0.1, u.amps || 0); return [-most, most]; }}},
-      cursor: {sync: {key: "watch"}, drag: {setScale: false}, bind: {dblclick: () => () => pause(false)}},
-      hooks: {
-        draw: [lines],
-        setCursor: [() => { pointed = u.cursor.idx == null || u.cursor.left < 0 ? null : u.data[0][u.cursor.idx]; tell(); }],
-        setSelect: [() => { if (u.select.width > 4) { zoomed = [u.posToVal(u.select.left, "x"), u.posToVal(u.select.left + u.select.width, "x")]; pause(true); u.setSelect({left: 0, width: 0}, false); } }],
-      },
-    }, [[], ...series.map(() => [])], place);
+    const chart = {x_label: "time [s]", y_label: kind === "speed" ? "rad/s" : "V, A", lines: [], spans: [], log: "", group: "watch", height: HEIGHT[kind]};
+    chart.curves = SHOWN[kind].map(([name, shade]) => ({name, color: shade, width: 1.5, kind: "line"}));
+    const made = options(chart, place.clientWidth || 280);
+    for (const one of made.series) one.spanGaps = true;
+    if (kind === "speed") made.series[1].dash = [5, 3];
+    made.legend = {show: false};
+    made.scales.y = {range: u => [-u.most || -1, u.most || 1]};
+    made.cursor = {...made.cursor, drag: {setScale: false}, bind: {dblclick: () => () => pause(false)}};
+    made.hooks.setCursor = [() => { pointed = u.cursor.idx == null || u.cursor.left < 0 ? null : u.data[0][u.cursor.idx]; tell(); }];
+    made.hooks.setSelect = [() => { if (u.select.width > 4) { zoomed = [u.posToVal(u.select.left, "x"), u.posToVal(u.select.left + u.select.width, "x")]; pause(true); u.setSelect({left: 0, width: 0}, false); } }];
+    const u = new uPlot(made, [[], ...chart.curves.map(() => [])], place);
+    u.limits = chart.lines;
     u.wheel = wheel; u.kind = kind;
     plots.push(u);
-    new ResizeObserver(() => { if (place.clientWidth && place.clientWidth !== u.width) u.setSize({width: place.clientWidth, height: PLOT[kind]}); }).observe(place);
+    new ResizeObserver(() => { if (place.clientWidth && place.clientWidth !== u.width) u.setSize({width: place.clientWidth, height: HEIGHT[kind]}); }).observe(place);
   }
   for (const place of document.querySelectorAll(".wheel .plot")) plot(place, place.closest(".wheel").id, place.dataset.kind);
 
@@ -122,10 +112,11 @@
     if (!times.length) return;
     const [begin, end] = range(), first = Math.max(0, from(begin) - 1), last = Math.min(times.length, from(end) + 1), x = times.slice(first, last);
     for (const u of plots) {
-      const data = SHOWN[u.kind].map(([, name]) => column(u.wheel, name).slice(first, last));
+      const data = SHOWN[u.kind].map(([name]) => column(u.wheel, name).slice(first, last));
       const size = list => list.reduce((most, v) => v == null ? most : Math.max(most, Math.abs(v)), 0);
-      if (u.kind === "speed") u.most = nice(1.05 * Math.max(0.5, ...data.map(size)));
-      else u.amps = nice(1.05 * Math.max(0.05, size(data[1])));
+      const supply = u.kind === "voltage" && state.supply[u.wheel];
+      u.most = supply ? 1.08 * supply : nice(1.05 * Math.max(0.5, ...data.map(size)));
+      if (supply) u.limits.splice(0, 2, supply, -supply);
       u.batch(() => { u.setData([x, ...data], false); u.setScale("x", {min: begin, max: end}); });
     }
   }
@@ -164,7 +155,7 @@
     if (changed(old.signals, state.signals) && state.signals.includes("fourier")) part("signal").value = "fourier";
     part("recordings").textContent = state.recordings.length ? `Recorded: ${state.recordings.join(", ")}.` : "No recording.";
     if (changed(old.motors, state.motors)) showMotors(state.motors);
-    if (old.identified !== state.identified) showReport(state.identified);
+    if (old.identified !== state.identified) part("report").src = state.identified ? `/results/${state.identified}/report.html` : "about:blank";
     const made = state.designed;
     part("designed").textContent = made ? `${made.name}: ${made.reason}.` : "No design.";
     part("gains").hidden = !made;
@@ -181,16 +172,6 @@
     part("motors").tBodies[0].replaceChildren(row("State", ...cells(one => [one.state, one.fit == null ? "" : `fit ${one.fit.toFixed(1)} %`])), ...[...names].map(name => row(name, ...cells(one => one.values[name]))));
     list("findings", Object.entries(motors).flatMap(([wheel, one]) => one.findings.map(([severity, text]) => [severity, `${label(wheel)}: ${text}`])));
   }
-  function showReport(name) {
-    part("report").querySelector("iframe")?.remove();
-    part("report").open = false;
-    part("report").dataset.source = name ? `/results/${name}/report.html` : "";
-  }
-  part("report").addEventListener("toggle", () => {
-    const source = part("report").dataset.source;
-    if (!part("report").open || !source || part("report").querySelector("iframe")) return;
-    part("report").append(Object.assign(document.createElement("iframe"), {src: source, title: "Report of the identification"}));
-  });
   function showRole(content) {
     role = content;
     part("role").textContent = role.drives ? (role.pages > 1 ? `drives; ${role.pages - 1} watching` : "drives") : "watches";
@@ -229,7 +210,7 @@
       figures[chart.name] = new uPlot(options(chart, place.clientWidth || 480), [[0, 1]], place);
       new ResizeObserver(() => { if (place.clientWidth) figures[chart.name].setSize({width: place.clientWidth, height: chart.height}); }).observe(place);
     }
-    part("share").value = 1; part("phase_margin").value = 60;
+    [part("share").value, part("phase_margin").value] = [1, 60];
     showDesign({...designs[part("wheel").value], ms: null});
   }
   function showDesign(made) {
@@ -297,32 +278,26 @@
     part("commanded").textContent = `${linear.toFixed(2)} m/s, ${angular.toFixed(2)} rad/s`;
   }, 50);
 
-  // Since the set-point of a wheel changed, until its speed stays within 5 % of the change.
-  const REST = 0.6, LEAST = 0.3, SMOOTH = 5;
-  let judged = 0;
+  // From a change of a wheel's set-point until its speed, over five samples, stays within 5 % of the change.
+  const changes = {}, REST = 0.6, LEAST = 0.3, SMOOTH = 5;
   function settle() {
-    const end = times.at(-1), rests = state.wheels.map(wheel => before(column(wheel, "setpoint"), times.length - 1));
-    if (rests.some(v => v == null) || end - judged < 0.2) return;
-    judged = end;
-    const found = state.wheels.map((wheel, w) => {
-      const asked = column(wheel, "setpoint"), speed = column(wheel, "speed");
-      let last = times.length - 1;
-      while (last > 0 && (asked[last] == null || Math.abs(asked[last] - rests[w]) < 1e-3)) last--;
-      if (last < 1 || end - times[last] < REST || end - times[last] > 3 * REST) return null;
-      let first = last;  // the change may be a ramp
-      while (first > 0 && times[last] - times[first] < 2 && (asked[first - 1] == null || Math.abs(asked[first - 1] - (asked[first] ?? asked[first - 1])) > 1e-6 || asked[first] == null)) first--;
-      const change = Math.abs(rests[w] - (asked[first] ?? rests[w]));
-      if (change < LEAST) return null;
-      let out = first;
-      for (let k = first; k < times.length - SMOOTH; k++) {
-        const some = speed.slice(k, k + SMOOTH).filter(v => v != null), mean = some.reduce((a, b) => a + b, 0) / some.length;
-        if (some.length && Math.abs(mean - rests[w]) > 0.05 * change) out = k + SMOOTH;
+    const end = times.at(-1);
+    for (const wheel of state.wheels) {
+      const asked = column(wheel, "setpoint"), target = before(asked, times.length - 1) ?? 0, one = changes[wheel] ||= {target, old: target, moved: 0};
+      if (Math.abs(target - one.target) > 1e-3) {  // it may be a ramp
+        if (end - one.moved > REST) one.old = one.target;
+        Object.assign(one, {target, moved: end, settled: null});
+      } else if (one.settled === null && end - one.moved > REST && Math.abs(target - one.old) > LEAST) {
+        let begin = from(one.moved), out = 0;
+        while (begin > 0 && (asked[begin - 1] == null || Math.abs(asked[begin - 1] - one.old) > 1e-6)) begin--;
+        const speed = column(wheel, "speed").slice(begin).filter(v => v != null), step = (end - times[begin]) / speed.length;
+        for (let k = SMOOTH; k <= speed.length; k++) if (Math.abs(speed.slice(k - SMOOTH, k).reduce((a, b) => a + b) / SMOOTH - target) > 0.05 * Math.abs(target - one.old)) out = k;
+        one.settled = 1000 * step * out;
       }
-      return [wheel, 1000 * (times[Math.min(out, times.length - 1)] - times[first])];
-    }).filter(Boolean);
-    if (found.length !== state.wheels.length) return;
-    const all = found.map(([, ms]) => ms);
-    part("settled").replaceChildren(...found.map(([wheel, ms]) => row(label(wheel), `${ms.toFixed(0)} ms`)), row("Spread", `${(Math.max(...all) - Math.min(...all)).toFixed(0)} ms`));
+    }
+    const all = state.wheels.map(wheel => changes[wheel].settled);
+    if (all.some(ms => ms == null)) return;
+    part("settled").replaceChildren(...state.wheels.map((wheel, k) => row(label(wheel), `${all[k].toFixed(0)} ms`)), row("Spread", `${(Math.max(...all) - Math.min(...all)).toFixed(0)} ms`));
   }
 
   matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => [...plots, ...Object.values(figures)].forEach(u => u.redraw(false, true)));

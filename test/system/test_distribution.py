@@ -69,7 +69,7 @@ def test_every_requirement_is_pinned_within_its_range(lock, monkeypatch):
                 pins.setdefault(canonicalize_name(pin.name), []).append(
                     str(pin.specifier).removeprefix("==")
                 )
-    extras = ("xlsx", "matlab") if lock == "jazzy.txt" else ("xlsx", "matlab", "ros")
+    extras = ("lab", "xlsx", "matlab", *(() if lock == "jazzy.txt" else ("ros",)))
     for text in [
         *given["install_requires"],
         *(t for e in extras for t in given["extras_require"][e]),

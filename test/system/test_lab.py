@@ -336,8 +336,8 @@ def test_the_whole_procedure_by_clicks(process, watcher, eventually, tmp_path, r
         for estimate in read_identification(folder).values():
             for quantity in estimate.combinations.values():
                 assert words.state(quantity) in shown
-        page.value("document.getElementById('report').open = true")
-        page.until("document.querySelector('#report iframe')")
+        page.value("document.getElementById('report').parentElement.open = true")
+        page.until(f"document.getElementById('report').src.endsWith('{folder.name}/report.html')")
 
         page.click("tune")
         page.until("document.querySelectorAll('#rows tr').length > 5")
