@@ -71,7 +71,7 @@ def watched(folder: Path, turn: Turn, seconds: float) -> Iterator[None]:
     """Let a page watch the robot inside the block, and measure it there."""
     with (
         tempfile.TemporaryFile("w+") as log,
-        tempfile.TemporaryDirectory() as profile,
+        tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as profile,
         subprocess.Popen(
             ["lab", "--output", str(folder), "--no-browser"], stdout=log, stderr=subprocess.STDOUT
         ) as lab,

@@ -8,11 +8,13 @@ that this writes. An argument names a folder in which an earlier run's results a
 from __future__ import annotations
 
 import os
+import re
 import shutil
 import signal
 import subprocess
 import sys
 import tempfile
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -23,7 +25,7 @@ ROOT = Path(__file__).resolve().parent.parent
 FIGURES = ROOT / "docs" / "figures"
 sys.path.insert(0, str(ROOT / "test"))
 
-from browser import CHROMIUM, Browser  # noqa: E402
+from browser import CHROMIUM, Browser, Clicks  # noqa: E402
 
 from smp_motor_control.nodes import loopback  # noqa: E402
 
@@ -31,7 +33,7 @@ DOMAIN = "87"
 """ROS domain of the simulated robot, where none is set."""
 WIDTH = 1280
 """Of the window [px]."""
-COLOURS = 48
+COLOURS = 96
 """Of a picture: charts and text need no more, and a picture stays below 100 kB."""
 PARTS = {
     "report": ("tuned/report.html", ("#front_left",)),
@@ -39,6 +41,13 @@ PARTS = {
     "commissioning": ("trial/report.html", ("h1", "#results")),
 }
 """Per picture the page, and the first and last of its parts that are shown."""
+LAB = {
+    "watch": (".bar", ".grid"),
+    "identify": ("#identify-title", "#motors"),
+    "tune": ("#tune-title", ".sliders", "#tune-charts"),
+    "drive": ("#drive-title", "#settled"),
+}
+"""Per picture of the page of lab, the outermost of its parts that are shown."""
 
 
 @contextmanager
@@ -73,15 +82,73 @@ def prepare(folder: Path) -> None:
 def draw(folder: Path) -> None:
     """Write every picture."""
     shutil.copy(folder / "demo" / "drive.svg", FIGURES / "drive.svg")
-    with tempfile.TemporaryDirectory() as profile, Browser(Path(profile)) as browser:
+    with (
+        tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as profile,
+        Browser(Path(profile)) as browser,
+    ):
         for name, (page, parts) in PARTS.items():
             browser.open(folder / page, WIDTH)
             path = FIGURES / f"{name}.png"
             browser.picture(path, *parts)
-            with Image.open(path) as shot:
-                drawn = shot.convert("RGB").quantize(COLOURS, dither=Image.Dither.NONE)
-            drawn.save(path, optimize=True)
-            print(f"pictures: {path.relative_to(ROOT)}: {path.stat().st_size / 1e3:.0f} kB")
+            shrink(path)
+
+
+def draw_lab(folder: Path) -> None:
+    """Write the pictures of the page of lab, which is used meanwhile."""
+    log = folder / "lab.log"
+    shutil.rmtree(folder / "lab_output", ignore_errors=True)
+    command = f"cd '{folder}' && exec lab --demo --no-browser > lab.log 2>&1"
+    log.unlink(missing_ok=True)
+    with (
+        running("bash", "-c", command),
+        tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as profile,
+    ):
+        while not (log.exists() and (found := re.findall(r"http://\S+", log.read_text()))):
+            time.sleep(0.5)
+        with Browser(Path(profile)) as browser:
+            page = Clicks(browser)
+            browser.open(found[-1], WIDTH)
+
+            def draw(name: str) -> None:
+                path = FIGURES / f"lab_{name}.png"
+                browser.drawn()
+                browser.picture(path, *LAB[name])
+                shrink(path)
+
+            page.until("Number(document.body.dataset.frames) >= 10")
+            page.arm()
+            page.set("seconds", 15)
+            page.click("excite")
+            page.until("document.getElementById('job').innerText.includes('14 of 15')")
+            draw("watch")
+            page.click("identify")
+            page.until("document.getElementById('motors').innerText.includes('identified')")
+            draw("identify")
+            page.click("tune")
+            page.until("document.querySelectorAll('#rows tr').length > 5")
+            for wheel in ("front_right", "rear_left", "rear_right", "front_left"):
+                page.set("wheel", wheel, "change")
+                page.arm()
+                page.click("apply")
+                page.until("document.getElementById('trial').innerText.startsWith('On trial')")
+                if wheel == "front_left":
+                    draw("tune")
+                page.click("keep")
+                page.until("document.getElementById('trial').innerText === ''")
+            page.arm()
+            page.value("document.getElementById('pad').focus()")
+            page.press("keyDown", "ArrowUp")
+            time.sleep(2.5)
+            draw("drive")
+            page.press("keyUp", "ArrowUp")
+
+
+def shrink(path: Path) -> None:
+    """Reduce a picture to the colours of a page."""
+    with Image.open(path) as shot:
+        drawn = shot.convert("RGB").quantize(COLOURS, dither=Image.Dither.NONE)
+    drawn.save(path, optimize=True)
+    print(f"pictures: {path.relative_to(ROOT)}: {path.stat().st_size / 1e3:.0f} kB")
 
 
 def main(arguments: list[str]) -> int:
@@ -93,6 +160,7 @@ def main(arguments: list[str]) -> int:
         folder = Path(arguments[0] if arguments else temporary).resolve()
         prepare(folder)
         draw(folder)
+        draw_lab(folder)
     return 0
 
 

@@ -147,3 +147,45 @@ class Browser:
         clip = {"x": left, "y": top, "width": right - left, "height": bottom - top, "scale": 1}
         shot = self.ask("Page.captureScreenshot", clip=clip, captureBeyondViewport=True)
         path.write_bytes(base64.b64decode(shot["data"]))
+
+
+class Clicks:
+    """A page in a browser, as a person uses it."""
+
+    def __init__(self, browser: Browser) -> None:
+        self.browser = browser
+
+    def value(self, expression: str):
+        return self.browser.value(expression)
+
+    def text(self, name: str) -> str:
+        return str(self.value(f"document.getElementById('{name}').innerText"))
+
+    def until(self, expression: str, seconds: float = 90.0) -> None:
+        end = time.monotonic() + seconds
+        while not self.value(f"Boolean({expression})"):
+            assert time.monotonic() < end, (expression, self.text("job"), self.text("messages"))
+            time.sleep(0.1)
+
+    def click(self, name: str) -> None:
+        """Press a button as soon as it can be."""
+        self.until(f"!document.getElementById('{name}').disabled")
+        self.value(f"document.getElementById('{name}').click()")
+
+    def set(self, name: str, value: object, event: str = "input") -> None:
+        self.value(
+            f"(() => {{ const one = document.getElementById('{name}'); one.value = {value!r}; "
+            f"one.dispatchEvent(new Event('{event}')); }})()"
+        )
+
+    def arm(self) -> None:
+        """Arm, again where a busy machine was silent for too long."""
+        if self.text("arm") != "Armed":
+            self.click("arm")
+        self.until(
+            "document.getElementById('arm').innerText === 'Armed' && "
+            "document.getElementById('job').innerText.startsWith('Armed')"
+        )
+
+    def press(self, kind: str, key: str) -> None:
+        self.browser.ask("Input.dispatchKeyEvent", type=kind, key=key, code=key)

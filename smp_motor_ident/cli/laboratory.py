@@ -222,9 +222,9 @@ class Laboratory:
             self.link.drive(float(message["linear"]), float(message["angular"]))
             return
         if wanted not in jobs:
-            raise ParameterError(f"{wanted!r} is not known")
+            raise ParameterError(f"the request {wanted!r} is not known")
         if wanted in ("excite", "apply", "step") and not self.link.armed:
-            raise ParameterError("arm first: nothing moves before")
+            raise ParameterError("press Arm first: nothing moves before it")
         if self.state["job"]:
             raise ParameterError(f"busy with {self.state['job']}; wait, or stop it")
         self._jobs.put(jobs[wanted])
@@ -236,7 +236,7 @@ class Laboratory:
         while True:
             interruption.check()
             if moving and not self.link.armed:
-                raise ProcessError(f"ended before its end: {self._reason}")
+                raise ProcessError(f"{self.state['job']} was stopped: {self._reason}")
             if done():
                 return
             if name:
@@ -247,7 +247,9 @@ class Laboratory:
         client, link = self.robot.client, self.link
         if not self._taken:
             if missing := self.robot.uncontrolled():
-                self.tell(f"No wheel_pid runs for {', '.join(missing)}: one is started.")
+                self.tell(
+                    f"No wheel_pid runs for {', '.join(missing)}; one is started and ended with lab."
+                )
                 self.robot.start_controllers(missing)
             self._stack.enter_context(client.paused(self.robot.wheels))
             self._taken = True
@@ -335,7 +337,7 @@ class Laboratory:
         self.candidates = dict(found["designs"])
         self.send("designs", found)
         self.state["designed"] = {"name": gains.name, "reason": found["reason"]}
-        self.tell(f"Designed gains for {', '.join(found['designs'])}: {gains.name}.")
+        self.tell(f"{gains.name} holds designed gains for {', '.join(found['designs'])}.")
 
     def _apply(self, wheel: str) -> None:
         """Set the gains that the page shows, and restore the old ones if the wheel misbehaves."""
@@ -363,7 +365,7 @@ class Laboratory:
 
     def _step(self, wheel: str) -> None:
         if wheel not in self.candidates:
-            raise ParameterError(f"{wheel or 'no wheel'} has no design; its step would be unknown")
+            raise ParameterError(f"{wheel or 'no wheel'} has no design; design one first")
         self._wait(self.link.is_body_idle, moving=True)
         self._activate(True)
         self._begin_step(wheel)

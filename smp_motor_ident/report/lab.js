@@ -289,7 +289,8 @@
         Object.assign(one, {target, moved: end, settled: null});
       } else if (one.settled === null && end - one.moved > REST && Math.abs(target - one.old) > LEAST) {
         let begin = from(one.moved), out = 0;
-        while (begin > 0 && (asked[begin - 1] == null || Math.abs(asked[begin - 1] - one.old) > 1e-6)) begin--;
+        const moved = value => value != null && Math.abs(value - one.old) > 1e-6;
+        while (begin > 0 && moved(before(asked, begin - 1))) begin--;
         const speed = column(wheel, "speed").slice(begin).filter(v => v != null), step = (end - times[begin]) / speed.length;
         for (let k = SMOOTH; k <= speed.length; k++) if (Math.abs(speed.slice(k - SMOOTH, k).reduce((a, b) => a + b) / SMOOTH - target) > 0.05 * Math.abs(target - one.old)) out = k;
         one.settled = 1000 * step * out;
