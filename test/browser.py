@@ -9,12 +9,14 @@ import select
 import shutil
 import subprocess
 import time
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
 CHROMIUM = next(
     filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), ""
 )
+AXE = find_spec("axe_core_python")
 
 
 class Browser:
@@ -105,14 +107,18 @@ class Browser:
         elif message.get("method") == "Runtime.consoleAPICalled" and given["type"] == "error":
             self.complaints.append(str(given["args"]))
 
-    def open(self, page: Path | str, width: int, *, dark: bool = False, height: int = 900) -> None:
-        """Show a file or an address at a width, and wait until it is loaded."""
+    def resize(self, width: int, *, dark: bool = False, height: int = 900) -> None:
+        """Show the page at a width, in light or dark."""
         self.ask(
             "Emulation.setDeviceMetricsOverride",
             width=width, height=height, deviceScaleFactor=1, mobile=width < 500,
         )  # fmt: skip
         scheme = {"name": "prefers-color-scheme", "value": "dark" if dark else "light"}
         self.ask("Emulation.setEmulatedMedia", features=[scheme])
+
+    def open(self, page: Path | str, width: int, *, dark: bool = False, height: int = 900) -> None:
+        """Show a file or an address at a width, and wait until it is loaded."""
+        self.resize(width, dark=dark, height=height)
         self.ask("Page.navigate", url=page if isinstance(page, str) else page.as_uri())
         while self._read().get("method") != "Page.loadEventFired":
             pass
@@ -147,6 +153,23 @@ class Browser:
         clip = {"x": left, "y": top, "width": right - left, "height": bottom - top, "scale": 1}
         shot = self.ask("Page.captureScreenshot", clip=clip, captureBeyondViewport=True)
         path.write_bytes(base64.b64decode(shot["data"]))
+
+
+def violations(browser: Browser) -> list[str]:
+    """What axe-core calls serious or critical, with the elements."""
+    browser.value(Path(AXE.origin).with_name("axe.min.js").read_text("utf-8") + ";0")
+    said = browser.ask(
+        "Runtime.evaluate", awaitPromise=True, returnByValue=True,
+        expression="axe.run(document, {resultTypes: ['violations']})"
+        ".then(r => JSON.stringify(r.violations))",
+    )  # fmt: skip
+    found: list[dict[str, Any]] = json.loads(said["result"]["value"])
+    return [
+        f"{one['id']}: {node['html'][:120]}: {node.get('failureSummary', '')}"
+        for one in found
+        if one["impact"] in ("serious", "critical")
+        for node in one["nodes"]
+    ]
 
 
 class Clicks:

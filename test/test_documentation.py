@@ -30,7 +30,7 @@ from smp_motor_control.motor.file import load_motors
 from smp_motor_control.ros_arguments import split_arguments
 from smp_motor_control.serial_protocol import decode_state, encode_age, encode_voltages
 from smp_motor_ident.bag.writer import BagWriter
-from smp_motor_ident.cli import commission, demo, identify, tune
+from smp_motor_ident.cli import commission, demo, identify, lab, tune
 from smp_motor_ident.nodes import play, record
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -44,6 +44,7 @@ PARSERS = {
     "tune": tune.parser,
     "commission": commission.parser,
     "demo": demo.parser,
+    "lab": lab.parser,
     "record": record.parser,
     "play": play.parser,
 }

@@ -221,7 +221,10 @@ class LiveLink:
                 self._listener.on_frame(slots, rows)
 
     def _stop_wheels(self) -> None:
-        reason, self._halt, self.armed, self._plans = self._halt, "", False, None
+        reason, self._halt = self._halt, ""
+        if not (self.armed or self.controlled):
+            return  # others may drive the wheels
+        self.armed, self._plans = False, None
         self._body = (0.0, 0.0, self._body[2])  # zero for as long as it would have driven
         self._send_setpoints({})
         if self.controlled:

@@ -83,9 +83,9 @@ class Server:
         self._laboratory.send = self._send
         if not _is_loopback(self._host):
             print(
-                f"WARNING: served on {self._host}: whoever has the address below and reaches this "
-                "machine can drive the robot, and the connection is not encrypted. Leave out --host"
-                " to serve this machine only",
+                f"WARNING: served on {self._host}: whoever has the address below, with this machine's "
+                "in place of 127.0.0.1, can drive the robot, and the connection is not encrypted. "
+                "Leave out --host to serve this machine only",
                 flush=True,
             )
         self._invite()

@@ -247,9 +247,8 @@ class Laboratory:
         client, link = self.robot.client, self.link
         if not self._taken:
             if missing := self.robot.uncontrolled():
-                self.tell(
-                    f"No wheel_pid runs for {', '.join(missing)}; one is started and ended with lab."
-                )
+                told = ", ".join(missing)
+                self.tell(f"No wheel_pid runs for {told}; one is started, and ended with lab.")
                 self.robot.start_controllers(missing)
             self._stack.enter_context(client.paused(self.robot.wheels))
             self._taken = True

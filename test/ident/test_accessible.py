@@ -1,14 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """The pages for people who see little or use no mouse: judged by axe-core in a browser."""
 
-import json
-from importlib.util import find_spec
-from pathlib import Path
-from typing import Any
-
 import numpy as np
 import pytest
-from browser import CHROMIUM, Browser
+from browser import AXE, CHROMIUM, Browser, violations
 from results import comparison, estimate, tuning_of_two
 
 from smp_motor_ident.finding import Finding
@@ -16,8 +11,6 @@ from smp_motor_ident.report import commissioning, fleet
 from smp_motor_ident.report.html import Report, render
 from smp_motor_ident.result import Quantity, plain
 from smp_motor_ident.tune.verification import Change, Reading
-
-AXE = find_spec("axe_core_python")
 
 pytestmark = pytest.mark.skipif(not CHROMIUM, reason="no Chromium on this machine")
 
@@ -72,23 +65,6 @@ def commissioning_page(_: pytest.MonkeyPatch) -> str:
     }  # fmt: skip
     rows = commissioning.results({"front_left": estimate()}, {}, document["changes"])
     return commissioning.render(document, [change], rows, "/**/front_left/wheel_pid:\n  p: 1.0\n")
-
-
-def violations(browser: Browser) -> list[str]:
-    """What axe-core calls serious or critical, with the elements."""
-    browser.value(Path(AXE.origin).with_name("axe.min.js").read_text("utf-8") + ";0")
-    said = browser.ask(
-        "Runtime.evaluate", awaitPromise=True, returnByValue=True,
-        expression="axe.run(document, {resultTypes: ['violations']})"
-        ".then(r => JSON.stringify(r.violations))",
-    )  # fmt: skip
-    found: list[dict[str, Any]] = json.loads(said["result"]["value"])
-    return [
-        f"{one['id']}: {node['html'][:120]}: {node.get('failureSummary', '')}"
-        for one in found
-        if one["impact"] in ("serious", "critical")
-        for node in one["nodes"]
-    ]
 
 
 @pytest.mark.skipif(AXE is None, reason="axe-core-python is not installed")

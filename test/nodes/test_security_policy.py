@@ -4,6 +4,7 @@
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 from unittest.mock import Mock
 
 import pytest
@@ -11,7 +12,7 @@ import rclpy
 from rclpy.node import Node
 
 from smp_motor_control import WHEELS
-from smp_motor_control.nodes import teleop_wheels
+from smp_motor_control.nodes import live_link, teleop_wheels
 from smp_motor_control.nodes.excite import Excite
 from smp_motor_control.nodes.motor_plant import MotorPlant
 from smp_motor_control.nodes.serial_driver import SerialDriver
@@ -29,10 +30,16 @@ def wheel_pid() -> Node:
     return node
 
 
+def lab() -> Node:
+    node = rclpy.create_node("lab")
+    live_link.LiveLink(SimpleNamespace(node=node), WHEELS, Mock())
+    return node
+
+
 NODES: list[tuple[str, Callable[[], Node]]] = [
     *((f"/{wheel}", wheel_pid) for wheel in WHEELS),
     ("/", SkidSteerNode), ("/", teleop_wheels.TeleopWheels), ("/", SerialDriver), ("/", MotorPlant),
-    ("/", Excite), ("/", Identifier),
+    ("/", Excite), ("/", Identifier), ("/", lab),
 ]  # fmt: skip
 
 
