@@ -10,6 +10,7 @@ from unittest.mock import Mock
 import pytest
 import rclpy
 from rclpy.node import Node
+from std_msgs.msg import String
 
 from smp_motor_control import WHEELS
 from smp_motor_control.nodes import live_link, teleop_wheels
@@ -33,6 +34,8 @@ def wheel_pid() -> Node:
 def lab() -> Node:
     node = rclpy.create_node("lab")
     live_link.LiveLink(SimpleNamespace(node=node), WHEELS, Mock())
+    for wheel in WHEELS:  # as RobotClient.paused does
+        node.create_subscription(String, f"{wheel}/motor_owner", lambda _: None, 1)
     return node
 
 
@@ -114,10 +117,11 @@ def test_the_wheels_may_do_alike_and_few_may_command_them():
         askers = {
             p for p, rule in rules.items() if f"/{wheel}/wheel_pid/change_state" in rule["request"]
         }
-        assert askers == {"/commission", "/tune", "/robot_guard"}
+        assert askers == {"/commission", "/lab", "/tune", "/robot_guard"}
         resetting = {
             p for p, rule in rules.items() if f"/{wheel}/wheel_pid/reset" in rule["request"]
         }
         assert resetting == {"/operator"}, "a latched wheel waits for a person"
-    assert publishers("/wheel_setpoints") == {"/skid_steer", "/teleop_wheels", "/commission"}
-    assert publishers("/cmd_vel") == {"/teleop_wheels"}
+    drivers = {"/skid_steer", "/teleop_wheels", "/commission", "/lab"}
+    assert publishers("/wheel_setpoints") == drivers
+    assert publishers("/cmd_vel") == {"/teleop_wheels", "/lab"}
