@@ -67,25 +67,24 @@ class History:
 
     def __init__(self, wheels: int) -> None:
         self._rows = np.full((int(KEPT_S / SLOT_S), wheels, len(COLUMNS)), math.nan)
-        self._newest = self._told = -1
-        self.origin = -1  # slot that counts as 0
+        self.newest = self._told = self.origin = -1  # slots: newest, last taken, first of all
 
     def add(self, wheel: int, columns: slice, stamps: Array, values: Array) -> None:
         """Put samples of one wheel into their slots."""
         slots = (stamps / SLOT_S).astype(np.int64)
         size, newest = len(self._rows), int(slots[-1])
-        if not 0 <= newest - self._newest < size and abs(newest - self._newest) > MAX_LATE_SLOTS:
+        if not 0 <= newest - self.newest < size and abs(newest - self.newest) > MAX_LATE_SLOTS:
             self._rows[:] = math.nan  # the first samples, or the clock was set
-            self._newest = self._told = newest
+            self.newest = self._told = newest
             self.origin = newest if self.origin < 0 else self.origin
-        elif newest > self._newest:
-            self._rows[np.arange(self._newest + 1, newest + 1) % size] = math.nan
-            self._newest = newest
+        elif newest > self.newest:
+            self._rows[np.arange(self.newest + 1, newest + 1) % size] = math.nan
+            self.newest = newest
         self._rows[slots % size, wheel, columns] = values
 
     def take(self) -> tuple[Array, Array]:
         """Return slots since the last call and their rows, without rows that hold nothing."""
-        end = max(self._newest - MAX_LATE_SLOTS, self._told)
+        end = max(self.newest - MAX_LATE_SLOTS, self._told)
         slots, self._told = np.arange(self._told + 1, end + 1), end
         rows = self._rows[slots % len(self._rows)]
         some = np.isfinite(rows[:, :, :3]).any(axis=(1, 2))
@@ -93,14 +92,9 @@ class History:
 
     def since(self, slot: int) -> tuple[Array, Array]:
         """Return the slots from ``slot`` on, and their rows."""
-        first = max(slot, self._newest - len(self._rows) + 1)
-        slots = np.arange(first, self._newest + 1)
+        first = max(slot, self.newest - len(self._rows) + 1)
+        slots = np.arange(first, self.newest + 1)
         return slots, self._rows[slots % len(self._rows)]
-
-    @property
-    def now(self) -> int:
-        """The newest slot."""
-        return self._newest
 
 
 class LiveLink:
@@ -144,7 +138,7 @@ class LiveLink:
         self._twist.header.frame_id = "base_link"
         self._setpoint = JointState(name=[joint_of(wheel) for wheel in wheels])
         stream = runtime.STREAM_PUBLISHER
-        self._twists = node.create_publisher(TwistStamped, "cmd_vel", stream)
+        self.twists = node.create_publisher(TwistStamped, "cmd_vel", stream)
         self._setpoints = node.create_publisher(JointState, "wheel_setpoints", stream)
         self._switches = [
             node.create_client(ChangeState, f"{controller_of(wheel)}/change_state")
@@ -173,10 +167,6 @@ class LiveLink:
         if self._plans is not None:
             self._plans = None
             self._send_setpoints({})
-
-    def can_drive(self) -> bool:
-        """Return whether a node takes cmd_vel."""
-        return bool(self._twists.get_subscription_count())
 
     def is_body_idle(self) -> bool:
         """Return whether skid_steer, after the last command to the body, yields the wheels."""
@@ -215,7 +205,7 @@ class LiveLink:
                     messages.append(taken[0])
             if messages:
                 self.history.add(wheel, columns, *decode(messages, numbers))
-        if self.history.now >= 0:
+        if self.history.newest >= 0:
             slots, rows = self.history.take()
             if slots.size:
                 self._listener.on_frame(slots, rows)
@@ -240,7 +230,7 @@ class LiveLink:
     def _send_twist(self, linear: float, angular: float) -> None:
         self._twist.header.stamp = self._client.node.get_clock().now().to_msg()
         self._twist.twist.linear.x, self._twist.twist.angular.z = linear, angular
-        self._twists.publish(self._twist)
+        self.twists.publish(self._twist)
 
     def _send_setpoints(self, speeds: Mapping[str, float]) -> None:
         self._setpoint.header.stamp = self._client.node.get_clock().now().to_msg()

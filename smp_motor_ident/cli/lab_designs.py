@@ -1,23 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
 """Designs for the page of ``lab``, in a process of their own that keeps motors and designs."""
 
-import math
 import os
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from smp_motor_control.parameter_file import flatten
 from smp_motor_ident.cli import tune, tuning
 from smp_motor_ident.cli.workers import end_with_parent
-from smp_motor_ident.errors import DesignError, SmpError
 from smp_motor_ident.report import tuning_page
 from smp_motor_ident.report.tuning_page import Choice
 from smp_motor_ident.result import Estimate
 from smp_motor_ident.tune import Design
-from smp_motor_ident.tune.case import prepare
 from smp_motor_ident.tune.curves import curves
-from smp_motor_ident.tune.designer import finish
 from smp_motor_ident.tune.feedback import Feedback
 from smp_motor_ident.tune.reference import STEP_SHARE
 from smp_motor_ident.tune.writing import parameters
@@ -70,26 +65,8 @@ def choose(wheel: str, share: float, phase_margin: float) -> dict[str, Any]:
 def judge(wheel: str, p: float, i: float, d: float) -> dict[str, Any]:
     """Return what gains [V per wheel rad/s] that were set by hand do."""
     estimate, own = _estimates[wheel], _own[wheel]
-    ratio = own.loop.gear_ratio
-    feedback = Feedback(p / ratio, i / ratio, d / ratio, own.feedback.filter_time)
-    given = {"samples": tuning_page.BAND_DRAWS, "together": own.together}
-    choice = Choice(math.nan, math.nan)
-    try:
-        case = prepare(estimate, own.loop, "margin", given)
-        robustness = case.ensemble.assess(feedback)
-        if robustness.stable < 1.0:
-            share = 100 * (1 - robustness.stable)
-            raise DesignError(
-                f"{wheel}: with these gains the loop is unstable for {share:.0f} % of the motors "
-                "within the uncertainty; lower p, i or d"
-            )
-        lead = own.reference if own.together else None
-        found = finish(case, feedback, 1.0, robustness, lead)
-        found = replace(found, reason="p, i and d set by hand")
-        choice = replace(choice, design=found, curves=curves(estimate, found))
-    except SmpError as error:
-        choice = replace(choice, reason=str(error))
-    return _describe(wheel, choice)
+    feedback = Feedback(p, i, d, own.feedback.filter_time).scaled(1 / own.loop.gear_ratio)
+    return _describe(wheel, tuning_page.judge(estimate, own, feedback))
 
 
 def _describe(wheel: str, choice: Choice) -> dict[str, Any]:

@@ -82,12 +82,10 @@ class Server:
         ready.result()
         self._laboratory.send = self._send
         if not _is_loopback(self._host):
-            print(
-                f"WARNING: served on {self._host}: whoever has the address below, with this machine's "
-                "in place of 127.0.0.1, can drive the robot, and the connection is not encrypted. "
-                "Leave out --host to serve this machine only",
-                flush=True,
+            text = (
+                "who has the address below, with this machine's for 127.0.0.1, can drive the robot"
             )
+            print(f"WARNING: served on {self._host}, not encrypted: {text}", flush=True)
         self._invite()
         if self._browse and (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
             webbrowser.open(self._address())

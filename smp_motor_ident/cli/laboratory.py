@@ -13,7 +13,7 @@ import queue
 import time
 from collections.abc import Callable, Mapping
 from concurrent.futures import ProcessPoolExecutor
-from contextlib import ExitStack
+from contextlib import ExitStack, closing
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -34,7 +34,6 @@ from smp_motor_ident.report import words
 from smp_motor_ident.report.document import read_identification
 from smp_motor_ident.result import UNITS, Quantity
 
-LONGEST_S = 300.0  # of an excitation
 TRIAL_S = 2.5  # for which gains on trial are watched
 STEP_AT_S, STEP_LASTS_S = 0.3, 1.2  # begin and length of the step of a trial
 STATE_S = 0.1  # shortest time between two messages about the state
@@ -74,7 +73,7 @@ def work(arguments: argparse.Namespace) -> int:
             client.wait_for_wheels(robot.wheels, timeout=15.0)
             client.refuse_second_reporters(robot.wheels)
         served = arguments.host, arguments.port, not arguments.no_browser
-        with Laboratory(robot, designs) as laboratory, Server(laboratory, *served):
+        with closing(Laboratory(robot, designs)) as laboratory, Server(laboratory, *served):
             laboratory.run()
     return 0
 
@@ -100,7 +99,7 @@ class Laboratory:
         self._jobs: queue.SimpleQueue[tuple[str, Callable[[], None]]] = queue.SimpleQueue()
         self._numbers = itertools.count(1)
         self._models: dict[str, Prediction] = {}
-        self._excited: set[str] = set()
+        self._recorded: dict[str, list[str]] = {}  # the wheels that each recording excites
         self._before: dict[str, dict[str, Any]] = {}  # parameters of wheels with gains on trial
         self.candidates: dict[str, dict[str, Any]] = {}  # the design that a page shows, by wheel
         self._told: tuple[float, str] = (0.0, "")
@@ -108,11 +107,7 @@ class Laboratory:
         self._stack = ExitStack()
         self._taken = False  # whether the controllers are this laboratory's
 
-    def __enter__(self) -> "Laboratory":
-        """Begin."""
-        return self
-
-    def __exit__(self, *_: object) -> None:
+    def close(self) -> None:
         """Stop the wheels, and give the controllers back."""
         client = self.robot.client
         self.link.halt("lab ends")
@@ -189,7 +184,8 @@ class Laboratory:
         if now - self._told[0] < STATE_S:
             return
         state["armed"] = link.armed
-        state["drives"] = link.can_drive()
+        state["drives"] = bool(link.twists.get_subscription_count())
+        state["recordings"] = [*self._recorded]
         state["supply"] = {w: one.supply_voltage for w, one in link.hardware.items()}
         space = str(self.robot.client.node.get_namespace()).strip("/")
         state["diagnostics"] = sorted(
@@ -209,7 +205,7 @@ class Laboratory:
         jobs: dict[str, tuple[str, Callable[[], None]]] = {
             "arm": ("arming", self._arm),
             "excite": ("exciting", lambda: self._excite(message)),
-            "discard": ("discarding recordings", self._discard),
+            "discard": ("discarding recordings", self._recorded.clear),
             "identify": ("identifying", self._identify),
             "tune": ("designing", lambda: self._tune(bool(message.get("accept")))),
             "apply": ("applying gains on trial", lambda: self._apply(str(message["wheel"]))),
@@ -266,8 +262,6 @@ class Laboratory:
         amplitude, duration = float(asked["amplitude"]), float(asked["seconds"])
         if not wheels:
             raise ParameterError("no wheel is chosen; choose one")
-        if not duration <= LONGEST_S:
-            raise ParameterError(f"the length is {duration:g} s; it is at most {LONGEST_S:g} s")
         supply = min(self.state["supply"].values(), default=12.0)
         bounds = {**self.robot.bounds, "max_voltage": supply}
         self._activate(False)
@@ -297,22 +291,18 @@ class Laboratory:
             steps.excite(moved, plan, lambda: self._wait(has_ended, moving=True))
         finally:
             processes.stop("excite", "record")
-        self.state["recordings"] = [*self.state["recordings"], name]
-        self._excited.update(wheels)
+        self._recorded[name] = wheels
         self._activate(True)
         self.tell(f"Recorded {name}: {asked['signal']}, {amplitude:g} V, {duration:g} s.")
 
-    def _discard(self) -> None:
-        self.state["recordings"] = []
-        self._excited.clear()
-
     def _identify(self) -> None:
-        bags = [str(self.folder / name) for name in self.state["recordings"]]
+        bags = [str(self.folder / name) for name in self._recorded]
         if not bags:
             raise ParameterError("there is no recording; excite the wheels first")
         self.robot.processes.stop("identifier")
         output = self.folder / f"identification_{next(self._numbers)}"
-        wheels = [a for wheel in sorted(self._excited) for a in ("--wheel", wheel)]
+        excited = sorted({wheel for some in self._recorded.values() for wheel in some})
+        wheels = [a for wheel in excited for a in ("--wheel", wheel)]
         given = [*bags, "--output", str(output), *wheels]
         self.robot.processes.start("identify", "identify", *given, priority=BACKGROUND)
         self._wait(lambda: self.robot.processes.has_ended("identify"), name="identify")
@@ -373,7 +363,7 @@ class Laboratory:
         self._show_step(wheel)
 
     def _begin_step(self, wheel: str) -> None:
-        self._stepped_at = self.link.history.now
+        self._stepped_at = self.link.history.newest
         change = float(self.candidates[wheel]["change"])
         plan = [(0.0, 0.0), (STEP_AT_S, change), (STEP_AT_S + STEP_LASTS_S, 0.0)]
         self.link.follow({wheel: plan})

@@ -44,7 +44,7 @@
   // Samples: one row for each slot of time, the columns of every wheel --------------------------------
 
   const times = [], values = [];  // values: one array for each wheel and column
-  let paused = false, zoomed = null, dirty = false, drawn = 0, cost = 0, told = 0, pointed = null;
+  let paused = false, zoomed = null, dirty = false, drawn = 0, cost = 0, told = 0, pointed = null, frames = 0;
 
   function take(table) {
     const width = 1 + state.wheels.length * state.columns.length;
@@ -120,7 +120,6 @@
       u.batch(() => { u.setData([x, ...data], false); u.setScale("x", {min: begin, max: end}); });
     }
   }
-  let frames = 0;
   setInterval(() => { document.body.dataset.frames = frames; frames = 0; }, 1000);
   function pause(yes) { paused = yes; if (!yes) zoomed = null; part("pause").setAttribute("aria-pressed", yes); redraw(); }
   part("pause").addEventListener("click", () => pause(!paused));
@@ -133,7 +132,6 @@
     link.href = URL.createObjectURL(new Blob([lines.join("\n") + "\n"], {type: "text/csv"}));
     link.download = "lab.csv";
     link.click();
-    setTimeout(() => URL.revokeObjectURL(link.href), 1000);
   });
 
   // State and roles ---------------------------------------------------------------------------------
@@ -151,8 +149,7 @@
       const [, level, text] = state.diagnostics.find(([name]) => name.endsWith(`${wheel}/wheel_pid`)) || ["", 0, "no wheel_pid"];
       Object.assign(part(wheel).querySelector(".health"), {textContent: text, className: `small health ${["", "warn", "bad", "bad"][level]}`});
     }
-    if (changed(old.signals, state.signals)) part("signal").replaceChildren(...state.signals.map(name => make("option", name)));
-    if (changed(old.signals, state.signals) && state.signals.includes("fourier")) part("signal").value = "fourier";
+    if (changed(old.signals, state.signals)) { part("signal").replaceChildren(...state.signals.map(name => make("option", name))); part("signal").value = "fourier"; }
     part("recordings").textContent = state.recordings.length ? `Recorded: ${state.recordings.join(", ")}.` : "No recording.";
     if (changed(old.motors, state.motors)) showMotors(state.motors);
     if (old.identified !== state.identified) part("report").src = state.identified ? `/results/${state.identified}/report.html` : "about:blank";
@@ -232,15 +229,11 @@
     }
     enable();
   }
-  function showStep(step) {
-    measured[step.wheel] = unpack(step.speed);
-    showDesign({...designs[step.wheel], asked: null});
-  }
+  function showStep(step) { measured[step.wheel] = unpack(step.speed); showDesign({...designs[step.wheel], asked: null}); }
   function request(values) {
     if (waiting) { pending = values; return; }
     waiting = true;
-    counter += 1;
-    ask("design", {wheel: part("wheel").value, asked: counter, ...values});
+    ask("design", {wheel: part("wheel").value, asked: ++counter, ...values});
   }
   for (const id of ["share", "phase_margin"]) part(id).addEventListener("input", () => request({share: Number(part("share").value), phase_margin: Number(part("phase_margin").value)}));
   for (const id of ["p", "i", "d"]) part(id).addEventListener("input", () => request(Object.fromEntries(["p", "i", "d"].map(name => [name, part(name).valueAsNumber]))));

@@ -4,8 +4,9 @@
 Nothing of control is computed in the page; its sliders choose among these designs.
 """
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -24,9 +25,11 @@ from smp_motor_ident.tune import (
     specification,
     writing,
 )
-from smp_motor_ident.tune.case import prepare, solve
+from smp_motor_ident.tune.case import Case, assess, prepare, solve
 from smp_motor_ident.tune.curves import Curves, curves
 from smp_motor_ident.tune.designer import finish
+from smp_motor_ident.tune.ensemble import Robustness
+from smp_motor_ident.tune.feedback import Feedback
 
 BANDWIDTH_SHARES = (0.3, 0.45, 0.65, 0.85, 1.0)
 """Of the bandwidth that the method chooses by itself, which is the largest integral gain's."""
@@ -104,13 +107,31 @@ def tuning_of(estimate: Estimate, loop: Loop, own: Design) -> Tuning:
 
 def choose(estimate: Estimate, loop: Loop, bandwidth: float, margin: float, own: Design) -> Choice:
     """Design for a bandwidth [rad/s] and a phase margin [deg], at the pace of ``own``."""
-    asked: dict[str, Any] = dict(bandwidth=bandwidth, phase_margin=margin, samples=BAND_DRAWS)
+    asked = dict(bandwidth=bandwidth, phase_margin=margin)
+    return _choice(estimate, loop, Choice(bandwidth, margin), own, asked, solve)
+
+
+def judge(estimate: Estimate, own: Design, feedback: Feedback) -> Choice:
+    """Return what gains that were set by hand do, at the pace of ``own``."""
+
+    def given(case: Case) -> tuple[Feedback, float, Robustness]:
+        return assess(case, feedback)
+
+    return _choice(estimate, own.loop, Choice(math.nan, math.nan), own, {}, given)
+
+
+def _choice(
+    estimate: Estimate, loop: Loop, asked: Choice, own: Design, targets: Mapping[str, Any],
+    solve_case: Callable[[Case], tuple[Feedback, float, Robustness]],
+) -> Choice:  # fmt: skip
+    targets = {**targets, "samples": BAND_DRAWS, "together": own.together}
+    lead = own.reference if own.together else None
     try:
-        case = prepare(estimate, loop, "margin", {**asked, "together": own.together})
-        found = finish(case, *solve(case), own.reference if own.together else None)
+        case = prepare(estimate, loop, "margin", targets)
+        found = finish(case, *solve_case(case), lead)
     except SmpError as error:
-        return Choice(bandwidth, margin, reason=str(error))
-    return Choice(bandwidth, margin, found, curves(estimate, found))
+        return replace(asked, reason=str(error))
+    return replace(asked, design=found, curves=curves(estimate, found))
 
 
 def page_charts(tunings: Mapping[str, Tuning]) -> list[Chart]:

@@ -189,6 +189,18 @@ def solve(case: Case) -> tuple[Feedback, float, Robustness]:
     return feedback, factor, robustness
 
 
+def assess(case: Case, feedback: Feedback) -> tuple[Feedback, float, Robustness]:
+    """Return given gains as :func:`solve` returns its own; refuse those of an unstable loop."""
+    robustness = case.ensemble.assess(feedback)
+    if robustness.stable < 1.0:
+        raise DesignError(
+            f"{case.wheel}: with these gains the loop is unstable for "
+            f"{100 * (1 - robustness.stable):.0f} % of the motors within the uncertainty; lower p, "
+            "i or d"
+        )
+    return feedback, 1.0, robustness
+
+
 def _within_clamp(problem: Problem, feedback: Feedback) -> tuple[Feedback, float]:
     """Reduce gains until the control noise fits within the clamp."""
     factor, trial = 1.0, feedback
