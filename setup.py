@@ -164,6 +164,7 @@ setup(
     packages=find_packages(include=[f"{NAME}*", "smp_motor_ident*"]),
     package_data={
         "": ["py.typed"],
+        "smp_motor_ident": ["limits.md"],
         "smp_motor_ident.report": ["*.jinja", "*.css", "*.js", "uplot/*"],
     },
     data_files=[

@@ -1,14 +1,20 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A threshold of a decision, with its unit, its reason and the test that shows it."""
+"""Every threshold of a decision, as a number by its name, read from the table in ``limits.md``.
 
-from dataclasses import dataclass
+The table states their units, reasons, and the tests that show them.
+"""
 
+import ast
+import re
+from pathlib import Path
+from typing import TYPE_CHECKING
 
-@dataclass(frozen=True)
-class Limit:
-    """One threshold: its value and unit, the reason for it, and the test that shows it."""
+_ROW = re.compile(r"\| `(\w+)` \| (\S+) \|")
 
-    value: float
-    unit: str
-    reason: str
-    test: str
+for _line in Path(__file__).with_suffix(".md").read_text("utf-8").splitlines():
+    if _row := _ROW.match(_line):
+        globals()[_row[1]] = ast.literal_eval(_row[2])
+
+if TYPE_CHECKING:
+
+    def __getattr__(name: str) -> float: ...

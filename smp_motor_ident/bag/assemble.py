@@ -11,9 +11,9 @@ from smp_motor_control.arrays import Array, Integers
 from smp_motor_control.motor.parameters import Gearbox
 from smp_motor_ident.bag import checks, clock, counter, mapping, units
 from smp_motor_ident.bag.axis import Motor, Series, resample_to_output, select_finite, unwrap_counts
-from smp_motor_ident.bag.limits import MAX_COUNT_STEP, MAX_STRAY_ROW_SHARE
 from smp_motor_ident.bag.storage import Table
 from smp_motor_ident.errors import BagError
+from smp_motor_ident.limits import MAX_COUNT_STEP, MAX_STRAY_ROW_SHARE
 from smp_motor_ident.quality.stamps import find_beat, moves_on
 from smp_motor_ident.record import Hardware, Record
 
@@ -99,7 +99,7 @@ def _check(motor: Motor, series: dict[str, Series]) -> None:
     """Drop impossible values and an unsigned current; sign a magnitude by its direction."""
     if "direction" in series:
         way, volts = series.pop("direction"), series["voltage"].value
-        stray = MAX_STRAY_ROW_SHARE.value * np.count_nonzero(volts)
+        stray = MAX_STRAY_ROW_SHARE * np.count_nonzero(volts)
         if min(np.sum(volts > 0), np.sum(volts < 0)) > stray:
             text = "the voltage has a sign already, so that the direction is not used; leave it out"
             motor.tell("direction_not_used", text)
@@ -121,7 +121,7 @@ def _check(motor: Motor, series: dict[str, Series]) -> None:
             count = unwrap_counts(motor, series).count
             value = (count - count[:1]).astype(np.float64)
             step = np.quantile(np.abs(np.diff(value)), 0.9) if value.size > 1 else 0.0
-            if step > MAX_COUNT_STEP.value and not motor.plan.own:
+            if step > MAX_COUNT_STEP and not motor.plan.own:
                 raise BagError(
                     f"{motor.where}: the count moves by {step:.2g} between samples, more than an "
                     "encoder counts; map the column of its counts"

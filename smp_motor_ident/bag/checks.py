@@ -6,14 +6,14 @@ from numpy.lib.stride_tricks import sliding_window_view
 
 from smp_motor_control.arrays import Array, Flags
 from smp_motor_ident.bag.axis import Series
-from smp_motor_ident.bag.limits import (
+from smp_motor_ident.errors import BagError
+from smp_motor_ident.limits import (
     MAX_JUMP_SPAN,
     MAX_JUMP_STEP,
     MIN_COUNTS_BETWEEN_PUBLISHERS,
     MIN_RETURNING_SHARE,
     UNSIGNED_CURRENT_RATIO,
 )
-from smp_motor_ident.errors import BagError
 
 _MIN_SAMPLES = 50
 _MAX_QUANTILE_SAMPLES = 5000  # values used for quantiles and means
@@ -36,14 +36,14 @@ def find_impossible_values(value: Array, *, steps_allowed: bool) -> Flags:
         span = max(high - low, 1e-3 * max(abs(low), abs(high)))
         step = np.abs(np.diff(x))
         usual = float(np.quantile(step[:: max(x.size // _MAX_QUANTILE_SAMPLES, 1)], 0.99))
-        if np.ptp(x) <= MAX_JUMP_SPAN.value * span and step.max() <= MAX_JUMP_STEP.value * usual:
+        if np.ptp(x) <= MAX_JUMP_SPAN * span and step.max() <= MAX_JUMP_STEP * usual:
             return none
         around = sliding_window_view(np.pad(x, 2, mode="edge"), 5)
         away = np.abs(x - np.median(around, axis=1))
-        bad = (away > MAX_JUMP_SPAN.value * span) & (span > 0)
+        bad = (away > MAX_JUMP_SPAN * span) & (span > 0)
         if not steps_allowed:
             both = np.zeros(x.size, bool)
-            both[1:-1] = np.minimum(step[:-1], step[1:]) > MAX_JUMP_STEP.value * usual
+            both[1:-1] = np.minimum(step[:-1], step[1:]) > MAX_JUMP_STEP * usual
             both[1:-1] &= np.diff(x)[:-1] * np.diff(x)[1:] < 0
             bad |= both & (away > 0.5 * span) & (usual > 0)
     none[sound[bad]] = True
@@ -54,9 +54,9 @@ def is_of_two_publishers(count: Array) -> bool:
     """Return whether a count jumps to and fro between two courses from sample to sample."""
     there = np.abs(np.diff(count))[:-1]
     back = np.abs(count[2:] - count[:-2])
-    returns = (there > MIN_COUNTS_BETWEEN_PUBLISHERS.value) & (back < 0.1 * there)
+    returns = (there > MIN_COUNTS_BETWEEN_PUBLISHERS) & (back < 0.1 * there)
     # Fewer samples may do so by chance.
-    return bool(count.size > 4 * _MIN_SAMPLES and np.mean(returns) > MIN_RETURNING_SHARE.value)
+    return bool(count.size > 4 * _MIN_SAMPLES and np.mean(returns) > MIN_RETURNING_SHARE)
 
 
 def is_unsigned(voltage: Series, current: Series) -> bool:
@@ -78,7 +78,7 @@ def is_unsigned(voltage: Series, current: Series) -> bool:
     if min(forward.mean(), backward.mean()) < 0.05:
         return False
     ahead, back = float(amperes[forward].mean()), float(amperes[backward].mean())
-    if abs(ahead + back) < UNSIGNED_CURRENT_RATIO.value * abs(ahead - back):
+    if abs(ahead + back) < UNSIGNED_CURRENT_RATIO * abs(ahead - back):
         return False
     low, high = np.quantile(amperes, [0.05, 0.95])
     return bool(low > -0.2 * high)  # some current may return to the supply

@@ -10,18 +10,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from smp_motor_control.arrays import Array, Integers
-from smp_motor_ident.bag.limits import MIN_CLOCK_LEAP_S, MIN_RESTART_ROWS
 from smp_motor_ident.bag.mapping import Signal
 from smp_motor_ident.bag.storage import Table, found
 from smp_motor_ident.bag.units import UNITS
 from smp_motor_ident.errors import BagError
+from smp_motor_ident.limits import MIN_CLOCK_LEAP_S, MIN_RESTART_ROWS
 
 Parts = list[tuple[int, int]]
 """Begin and end of runs of rows."""
 
 MISSING_TIME = -(2**62)  # time of a row without one
 
-_ROWS = round(MIN_RESTART_ROWS.value)
+_ROWS = round(MIN_RESTART_ROWS)
 _BEFORE = 1000  # smallest number of earlier rows examined
 
 _SECOND = 1_000_000_000
@@ -220,7 +220,7 @@ def _parts(time: NDArray[Any], columns: Mapping[str, NDArray[Any]]) -> Parts:
     moved = steps[steps > 0]
     if not moved.size:
         return [(0, time.size)]
-    back = np.flatnonzero(np.diff(time) < -MIN_RESTART_ROWS.value * np.median(moved)) + 1
+    back = np.flatnonzero(np.diff(time) < -MIN_RESTART_ROWS * np.median(moved)) + 1
     if back.size * 2 * _ROWS > time.size:  # shuffled, not restarted
         return [(0, time.size)]
     # Not a single row that came early or late: most rows that follow are earlier than those before
@@ -279,7 +279,7 @@ def remove_leaps(
     """
     every = np.sort(np.concatenate(list(times.values())))
     steps = np.diff(every.view(np.uint64))  # the farthest two have no signed distance
-    last = np.flatnonzero(steps > MIN_CLOCK_LEAP_S.value * _SECOND)
+    last = np.flatnonzero(steps > MIN_CLOCK_LEAP_S * _SECOND)
     if not last.size:
         return dict(times), []
     leaps = steps[last]

@@ -7,15 +7,15 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from smp_motor_control.arrays import Array, Integers
-from smp_motor_ident.bag.limits import (
+from smp_motor_ident.bag.storage import found
+from smp_motor_ident.errors import BagError
+from smp_motor_ident.finding import Finding
+from smp_motor_ident.limits import (
     MAX_WIDTH_ERROR,
     MIN_ALIASED_STEP_SHARE,
     MIN_ALIASED_STEPS,
     MIN_SATURATED_SHARE,
 )
-from smp_motor_ident.bag.storage import found
-from smp_motor_ident.errors import BagError
-from smp_motor_ident.finding import Finding
 
 _WIDTHS = (32, 24, 20, 18, 17, 16, 15, 14, 13, 12, 11, 10, 8)
 _MIN_WRAPS = 3  # wraps needed to estimate a width; fewer may be faults
@@ -35,7 +35,7 @@ class Wrap:
     @property
     def is_known(self) -> bool:
         """Whether the width is sure enough to be undone: its error is the motion's."""
-        return self.deviation < MAX_WIDTH_ERROR.value * self.width
+        return self.deviation < MAX_WIDTH_ERROR * self.width
 
     def admits(self, width: float) -> bool:
         """Return whether a width agrees with the signal within four standard deviations."""
@@ -175,7 +175,7 @@ def is_full(count: Integers) -> int:
     """Return the end of a range at which a counter stays, or 0."""
     for last in (int(count.max()), int(count.min())) if count.size > 1 else ():
         size = last + 1 if last > 0 else -last  # 2^k - 1 at the upper end, -2^k at the lower
-        stays = np.mean((count[1:] == last) & (count[:-1] == last)) > MIN_SATURATED_SHARE.value
+        stays = np.mean((count[1:] == last) & (count[:-1] == last)) > MIN_SATURATED_SHARE
         if size >= 2**7 and not size & (size - 1) and stays:
             return last
     return 0
@@ -264,7 +264,7 @@ def check_aliasing(steps: Array, width: float, what: str) -> None:
     Fast rotation then changes into fast reverse rotation without slowing down, several times, or
     once with long runs on either side.
     """
-    if np.abs(steps).max(initial=0.0) < MIN_ALIASED_STEP_SHARE.value * width:
+    if np.abs(steps).max(initial=0.0) < MIN_ALIASED_STEP_SHARE * width:
         return
     fast = np.sign(steps) * (np.abs(steps) > width / 8)
     before, a, b, after = fast[1:-4], fast[2:-3], fast[3:-2], fast[4:-1]
@@ -272,10 +272,7 @@ def check_aliasing(steps: Array, width: float, what: str) -> None:
     over &= np.abs(np.diff(steps))[2:-2] > width / 2
     edge = np.abs(steps) > 0.4 * width
     once = over & (fast[:-5] == before) & (after == fast[5:]) & edge[2:-3] & edge[3:-2]
-    if (
-        np.count_nonzero(over) + MIN_ALIASED_STEPS.value * np.count_nonzero(once)
-        >= MIN_ALIASED_STEPS.value
-    ):
+    if np.count_nonzero(over) + MIN_ALIASED_STEPS * np.count_nonzero(once) >= MIN_ALIASED_STEPS:
         raise BagError(
             f"the {what} turns by more than half of its {width:.4g} from sample to sample, so "
             "its direction is ambiguous; record it at least twice as often, or record the speed"

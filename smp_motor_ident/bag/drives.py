@@ -8,13 +8,13 @@ import numpy as np
 from numpy.fft import irfft, rfft
 
 from smp_motor_control.arrays import Array, Integers
-from smp_motor_ident.bag.limits import (
+from smp_motor_ident.limits import (
     EXPLANATION_LEVEL,
+    HALF_EXPLAINED,
     MAX_LATE_COMMAND_RESIDUAL,
     MAX_SHIFTED_RESIDUAL_RATIO,
 )
 from smp_motor_ident.quality.lag import lagged
-from smp_motor_ident.quality.limits import HALF_EXPLAINED
 
 LAGS, OWN = 6, 2
 MAX_DELAY_ROWS = 200  # largest delay of a command behind its motion that is searched [rows]
@@ -48,7 +48,7 @@ def find_unexplained_share(u: Array, y: Array) -> float | None:
         rests.append(float(np.sum((target - matrix @ solution) ** 2)) + 1e-12)
     free = target.size - OWN - LAGS - 1
     ratio = (rests[0] - rests[1]) / LAGS / (rests[1] / free)
-    return rests[1] / rests[0] if fdtrc(LAGS, free, ratio) < EXPLANATION_LEVEL.value else None
+    return rests[1] / rests[0] if fdtrc(LAGS, free, ratio) < EXPLANATION_LEVEL else None
 
 
 def responds_in_its_row(u: Array, y: Array) -> bool:
@@ -66,7 +66,7 @@ def responds_in_its_row(u: Array, y: Array) -> bool:
     size = steps[new + 1]
     at_once, later = float(size @ jumps[new]), float(size @ jumps[new + 1])
     scatter = float(np.nanstd(np.delete(jumps, new)) * np.linalg.norm(size))
-    return at_once > max(-NormalDist().inv_cdf(EXPLANATION_LEVEL.value) * scatter, later)
+    return at_once > max(-NormalDist().inv_cdf(EXPLANATION_LEVEL) * scatter, later)
 
 
 def find_following_share(u: Array, y: Array) -> tuple[float, bool]:
@@ -78,7 +78,7 @@ def find_following_share(u: Array, y: Array) -> tuple[float, bool]:
     if np.count_nonzero(np.diff(u)) < LAGS or _is_clock(u) or _is_clock(y):
         return 0.0, False
     steps = np.diff(y, prepend=y[:1])
-    itself = find_lagged_share(u, y) if _explained_share(u, steps) < HALF_EXPLAINED.value else 0.0
+    itself = find_lagged_share(u, y) if _explained_share(u, steps) < HALF_EXPLAINED else 0.0
     return max((itself, False), (find_lagged_share(u, steps), True))
 
 
@@ -117,8 +117,7 @@ def find_late_rows(u: Array, y: Array) -> int:
     leading = min(left[shift] for shift in range(-3, 1))
     return (
         best
-        if left[best]
-        < min(MAX_LATE_COMMAND_RESIDUAL.value, MAX_SHIFTED_RESIDUAL_RATIO.value * leading)
+        if left[best] < min(MAX_LATE_COMMAND_RESIDUAL, MAX_SHIFTED_RESIDUAL_RATIO * leading)
         else 0
     )
 
@@ -154,7 +153,7 @@ def find_lagged_share(u: Array, y: Array) -> float:
     """Return the share of a signal explained by a lag of another; 0 if another shift is better."""
     lags = np.geomspace(1.0, max(y.size / 20, 2.0), 8)
     share = max(_explained_share(lagged(u - u[0], float(lag)), y) for lag in lags)
-    return share if share > max(HALF_EXPLAINED.value, _explained_share(u, y)) else 0.0
+    return share if share > max(HALF_EXPLAINED, _explained_share(u, y)) else 0.0
 
 
 def find_clock(values: list[Array]) -> int | None:

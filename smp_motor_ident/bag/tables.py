@@ -10,7 +10,8 @@ import numpy as np
 
 from smp_motor_control.arrays import Flags, Integers
 from smp_motor_control.errors import is_ros_name
-from smp_motor_ident.bag import clock, limits, units
+from smp_motor_ident import limits
+from smp_motor_ident.bag import clock, units
 from smp_motor_ident.bag.mapping import DEFAULT_MOTOR, MotorMap, Signal, SignalMap
 from smp_motor_ident.bag.names import MOTIONS, separates_motors
 from smp_motor_ident.bag.readers.grid import without_unit
@@ -156,7 +157,7 @@ def separate_motors(
                 continue
             of = tables[topic].columns[column]
             numbers, counts = np.unique(of[np.isfinite(of)], return_counts=True)
-            stray = limits.MAX_STRAY_ROW_SHARE.value * of.size
+            stray = limits.MAX_STRAY_ROW_SHARE * of.size
             numbers, counts = numbers[counts > stray], counts[counts > stray]
             if numbers.size < 2 or of.size - counts.sum() > stray:
                 continue
@@ -243,7 +244,7 @@ def _check_seconds(log: Integers, signal: Signal, recording: Recording) -> None:
     """Refuse a time without unit whose rows are too far apart for seconds."""
     steps = np.diff(log[log > clock.MISSING_TIME]) * 1e-9
     step = float(np.median(steps)) if steps.size else 0.0
-    if step >= limits.MAX_ROW_INTERVAL_S.value:
+    if step >= limits.MAX_ROW_INTERVAL_S:
         raise BagError(
             f"{recording.files[0]}: {signal.field} rises by {step:g} per row, too fast for "
             f"seconds; give its unit: time={signal.field}:ms (or us, ns; s if it is seconds)"

@@ -12,9 +12,9 @@ from rosbags import typesys
 from rosbags.interfaces import Nodetype
 from rosbags.typesys import Stores, TypesysError, get_typestore
 
-from smp_motor_ident.bag.limits import MAX_DEFINITION_SIZE
 from smp_motor_ident.bag.storage import Channel, first_line, message_type
 from smp_motor_ident.errors import BagError
+from smp_motor_ident.limits import MAX_DEFINITION_SIZE
 
 Fields = Sequence[tuple[str, Any]]
 Definitions = Mapping[str, Fields]
@@ -31,9 +31,9 @@ _LINE = "=" * 80 + "\n"
 def _parse(text: str, name: str, form: str) -> dict[str, Fields]:
     """Return the fields of all messages that a definition text holds."""
     text = "\n".join(filter(str.strip, text.splitlines()))  # many empty lines would take hours
-    if len(text) > MAX_DEFINITION_SIZE.value:
+    if len(text) > MAX_DEFINITION_SIZE:
         raise BagError(
-            f"its definition has {len(text)} characters, more than {MAX_DEFINITION_SIZE.value:.0f}"
+            f"its definition has {len(text)} characters, more than {MAX_DEFINITION_SIZE:.0f}"
         )
     if form == "ros2idl" or text.startswith(_LINE + "IDL: "):
         types: dict[str, Any] = {}
@@ -77,7 +77,7 @@ class Types:
     def __init__(self, files: Iterable[str | os.PathLike[str]] = ()) -> None:
         self._given: dict[str, Fields] = {}
         self._seen: set[str] = set()
-        self._left = 6 * MAX_DEFINITION_SIZE.value
+        self._left = 6 * MAX_DEFINITION_SIZE
         for given in files:
             path = Path(given)
             found = (
@@ -127,9 +127,7 @@ class Types:
         self._left -= 0 if text in self._seen else len(text)
         self._seen.add(text)
         if self._left < 0:
-            raise BagError(
-                f"definitions have more than {6 * MAX_DEFINITION_SIZE.value:.0f} characters"
-            )
+            raise BagError(f"definitions have more than {6 * MAX_DEFINITION_SIZE:.0f} characters")
 
     def _named(self, name: str) -> dict[str, Fields]:
         """Return a definition by the type's last name where the user's folder says no package."""

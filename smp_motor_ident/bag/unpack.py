@@ -20,9 +20,9 @@ import lz4.frame
 import numpy as np
 from backports import zstd  # from Python 3.14 on: compression.zstd
 
-from smp_motor_ident.bag.limits import MAX_UNPACKING_RATIO, MIN_UNPACKED_LIMIT
 from smp_motor_ident.bag.storage import Batch, gather, join
 from smp_motor_ident.errors import BagError
+from smp_motor_ident.limits import MAX_UNPACKING_RATIO, MIN_UNPACKED_LIMIT
 
 VARIABLE = "SMP_BAG_UNPACKED"
 MAGIC = {b"\x28\xb5\x2f\xfd": "zstd", b"\x04\x22\x4d\x18": "lz4"}
@@ -42,7 +42,7 @@ class Budget:
     def __init__(self, name: str, packed: int) -> None:
         self.name = name
         self.limit = _read_user_limit() or int(
-            max(MIN_UNPACKED_LIMIT.value, MAX_UNPACKING_RATIO.value * packed)
+            max(MIN_UNPACKED_LIMIT, MAX_UNPACKING_RATIO * packed)
         )
         self.left = self.limit
 

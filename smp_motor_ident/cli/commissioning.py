@@ -21,10 +21,11 @@ from smp_motor_ident import bag
 from smp_motor_ident.cli import checking, commission, driving, plan, protocol, steps
 from smp_motor_ident.cli.processes import ProcessError, Processes, connect
 from smp_motor_ident.cli.protocol import Protocol
-from smp_motor_ident.commission import validation_run, wheel_limits, winding
+from smp_motor_ident.commission import validation_run, winding
 from smp_motor_ident.errors import ParameterError
 from smp_motor_ident.finding import Finding
 from smp_motor_ident.infer.validation import simulate
+from smp_motor_ident.limits import MAX_SPEED_RATIO
 from smp_motor_ident.report.document import read_identification
 from smp_motor_ident.result import Estimate
 
@@ -186,7 +187,7 @@ def _record(session: Session, one: plan.Recording) -> None:
     robot.client.refuse_second_reporters(robot.wheels)
     speed = session.protocol.document.get("speed")
     if speed and not arguments.max_speed:
-        fastest = wheel_limits.MAX_SPEED_RATIO.value * float(speed)
+        fastest = MAX_SPEED_RATIO * float(speed)
         robot = replace(robot, bounds={**robot.bounds, "max_speed": fastest})
     session.begin(one.part, one.describe())
     draft = robot.folder / DRAFT

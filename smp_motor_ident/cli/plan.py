@@ -10,8 +10,8 @@ import numpy as np
 
 from smp_motor_control.excitation import SIGNALS as SHAPES
 from smp_motor_ident.cli.steps import Excitation
-from smp_motor_ident.commission.wheel_limits import REQUIRED_ACCURACY
 from smp_motor_ident.infer.planning import what_next
+from smp_motor_ident.limits import REQUIRED_ACCURACY
 from smp_motor_ident.result import Estimate
 
 FITTED, HELD_OUT = "excitation", "validation"
@@ -75,7 +75,7 @@ def plan_further(estimates: Mapping[str, Estimate], amplitude: float) -> Recordi
     less than the accuracy wanted.  Of several wheels the one that needs the longest decides.
     """
     proposals = [
-        what_next(one, REQUIRED_ACCURACY.value, supply=amplitude, longest=MAX_FURTHER_S)
+        what_next(one, REQUIRED_ACCURACY, supply=amplitude, longest=MAX_FURTHER_S)
         for one in estimates.values()
         if _is_open(one)
     ]
@@ -90,7 +90,7 @@ def _is_open(estimate: Estimate) -> bool:
     known = {**estimate.parameters, **estimate.combinations}
     names = ("dc_gain", "time_constant", "resistance", "motor_constant", "inertia")
     given = (one for name in names if (one := known.get(name)) is not None and one.value)
-    return any((q.std or 0.0) > REQUIRED_ACCURACY.value * abs(q.value or 0.0) for q in given)
+    return any((q.std or 0.0) > REQUIRED_ACCURACY * abs(q.value or 0.0) for q in given)
 
 
 class Schedule:
@@ -185,7 +185,7 @@ def draw_plan(amplitude: float, duration: float, wheels: Sequence[str]) -> list[
         lines.append(f"  {bars}")
         begin += part.duration
     total = format_duration(schedule(wheels, parts).left())
-    accuracy = 100 * REQUIRED_ACCURACY.value
+    accuracy = 100 * REQUIRED_ACCURACY
     lines += [
         f"then: identify; where a number is not known to {accuracy:g} %, one more Fourier signal "
         f"of at most {MAX_FURTHER_S:g} s; tune; a drive of some {DRIVE:g} s with the gains on "

@@ -9,8 +9,8 @@ import numpy as np
 from scipy import stats
 
 from smp_motor_control.arrays import Array
-from smp_motor_ident.commission.wheel_limits import VALIDATION_LEVEL, VALIDATION_TOLERANCE
 from smp_motor_ident.finding import Finding
+from smp_motor_ident.limits import VALIDATION_LEVEL, VALIDATION_TOLERANCE
 
 BLOCK = 0.5
 """Correlation time of simulation errors [s]; a longer stretch counts as an independent error."""
@@ -43,7 +43,7 @@ def judge(wheel: str, fitted: Sequence[Simulated], held_out: Sequence[Simulated]
     share = math.sqrt(after.mean()) / scatter if scatter > 0 else math.inf
     expected = math.sqrt(before.mean()) / scatter if scatter > 0 else math.inf
     ratio = float(after.mean() / max(before.mean(), 1e-300))
-    limit = float(stats.f.isf(VALIDATION_LEVEL.value, after.size, before.size))
+    limit = float(stats.f.isf(VALIDATION_LEVEL, after.size, before.size))
     text = (
         f"{wheel}: {100 * (1 - share):.2f} % of the speed explained in the validation run; "
         f"the fit predicts {100 * (1 - expected):.2f} %"
@@ -54,7 +54,7 @@ def judge(wheel: str, fitted: Sequence[Simulated], held_out: Sequence[Simulated]
         "variance_ratio": ratio,
         "limit": limit,
     }
-    if ratio > limit and share > VALIDATION_TOLERANCE.value:
+    if ratio > limit and share > VALIDATION_TOLERANCE:
         return Finding(
             "validation_run",
             "refused",

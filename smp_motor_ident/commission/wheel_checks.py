@@ -11,7 +11,9 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from smp_motor_ident.commission.wheel_limits import (
+from smp_motor_ident.commission.wheel_test import Figures
+from smp_motor_ident.finding import Finding, Severity
+from smp_motor_ident.limits import (
     BREAKAWAY_COUNTS,
     MAX_DEAD_ZONE_SHARE,
     MAX_FEEDBACK_AGE,
@@ -21,8 +23,6 @@ from smp_motor_ident.commission.wheel_limits import (
     MIN_FEEDBACK_RATE,
     VELOCITY_TOLERANCE,
 )
-from smp_motor_ident.commission.wheel_test import Figures
-from smp_motor_ident.finding import Finding, Severity
 from smp_motor_ident.record import Hardware
 
 
@@ -48,19 +48,19 @@ Check = Callable[[Robot], Iterator[Finding]]
 def feedback(robot: Robot) -> Iterator[Finding]:
     """Check that samples are frequent, with increasing stamps of this clock."""
     for wheel, one in robot.figures.items():
-        if not one.rate >= MIN_FEEDBACK_RATE.value:
+        if not one.rate >= MIN_FEEDBACK_RATE:
             yield Finding(
                 "feedback_rate", "refused",
                 f"{wheel}: motor_state comes {one.rate:.3g} times a second",
-                {"wheel": wheel, "rate": one.rate, "least": MIN_FEEDBACK_RATE.value},
+                {"wheel": wheel, "rate": one.rate, "least": MIN_FEEDBACK_RATE},
                 "publish motor_state 100 times a second or more, stamped when it was sampled",
             )  # fmt: skip
-        if abs(one.age) > MAX_FEEDBACK_AGE.value:
+        if abs(one.age) > MAX_FEEDBACK_AGE:
             yield Finding(
                 "feedback_age", "refused",
                 f"{wheel}: stamps of motor_state are {abs(one.age):.3g} s "
                 f"{'old on arrival' if one.age > 0 else 'ahead of this clock'}",
-                {"wheel": wheel, "age": one.age, "limit": MAX_FEEDBACK_AGE.value},
+                {"wheel": wheel, "age": one.age, "limit": MAX_FEEDBACK_AGE},
                 "stamp when it is sampled, on a clock that is synchronised with this one (chrony), "
                 "or run this tool with use_sim_time where the robot does",
             )  # fmt: skip
@@ -83,17 +83,17 @@ def position(robot: Robot) -> Iterator[Finding]:
 def motion(robot: Robot) -> Iterator[Finding]:
     """Check that each command turns its wheel and no other, and not before."""
     for wheel, one in robot.figures.items():
-        if one.at_rest > BREAKAWAY_COUNTS.value:
+        if one.at_rest > BREAKAWAY_COUNTS:
             yield Finding(
                 "motion_at_zero_voltage", "refused",
                 f"{wheel}: turned by {one.at_rest:.0f} counts under zero voltage",
-                {"wheel": wheel, "counts": one.at_rest, "limit": BREAKAWAY_COUNTS.value},
+                {"wheel": wheel, "counts": one.at_rest, "limit": BREAKAWAY_COUNTS},
                 "see that nothing else drives or turns the wheel, and that the encoder counts "
                 "only motion",
             )  # fmt: skip
         moved = robot.moved.get(wheel, {})
-        others = [w for w, n in moved.items() if w != wheel and n > BREAKAWAY_COUNTS.value]
-        own = moved.get(wheel, math.inf) > BREAKAWAY_COUNTS.value
+        others = [w for w, n in moved.items() if w != wheel and n > BREAKAWAY_COUNTS]
+        own = moved.get(wheel, math.inf) > BREAKAWAY_COUNTS
         if others and not own:
             yield Finding(
                 "crossed_wheels", "refused",
@@ -168,7 +168,7 @@ def gear_ratio(robot: Robot) -> Iterator[Finding]:
         ratio = abs(one.velocity_ratio)
         gain = one.gain / robot.gains.get(wheel, math.nan)
         said = f"gear_ratio {described.gear_ratio:g}"
-        if abs(ratio - 1.0) > VELOCITY_TOLERANCE.value:
+        if abs(ratio - 1.0) > VELOCITY_TOLERANCE:
             yield Finding(
                 "gear_ratio", "refused",
                 f"{wheel}: reported velocity is {ratio:.3g} times what counts show with {said} "
@@ -177,14 +177,14 @@ def gear_ratio(robot: Robot) -> Iterator[Finding]:
                 f"one of these numbers is wrong in motor_description or in the driver; with the "
                 f"driver's a gear ratio of {described.gear_ratio / ratio:.4g} would fit",
             )  # fmt: skip
-        if abs(known / described.gear_ratio - 1.0) > VELOCITY_TOLERANCE.value:
+        if abs(known / described.gear_ratio - 1.0) > VELOCITY_TOLERANCE:
             yield Finding(
                 "gear_ratio", "refused",
                 f"{wheel}: motor_description has {said}, the motor file {known:g}",
                 {"wheel": wheel, "described": described.gear_ratio, "known": known},
                 "correct the one that is wrong",
             )  # fmt: skip
-        if abs(math.log(gain)) > math.log(MAX_GAIN_RATIO.value) if gain > 0 else False:
+        if abs(math.log(gain)) > math.log(MAX_GAIN_RATIO) if gain > 0 else False:
             yield Finding(
                 "unexpected_gain", "refused",
                 f"{wheel}: turns at {gain:.3g} times the speed per volt that the motor file has",
@@ -210,7 +210,7 @@ def dead_zone(robot: Robot) -> Iterator[Finding]:
     for wheel, one in robot.figures.items():
         supply = robot.hardware[wheel].supply_voltage or 12.0
         beyond = one.breakaway - max(one.friction, 0.0)
-        if beyond > MAX_DEAD_ZONE_SHARE.value * supply:
+        if beyond > MAX_DEAD_ZONE_SHARE * supply:
             yield Finding(
                 "dead_zone", "warning",
                 f"{wheel}: starts to turn at {one.breakaway:.2f} V and keeps turning at "
@@ -234,7 +234,7 @@ def supply(robot: Robot) -> Iterator[Finding]:
                 "publish the mean voltage of the interval before the stamp, duty cycle times "
                 "supply where nothing measures it",
             )  # fmt: skip
-        if 0 < one.applied < 1.0 - MAX_SUPPLY_SHORTFALL.value:
+        if 0 < one.applied < 1.0 - MAX_SUPPLY_SHORTFALL:
             yield Finding(
                 "supply_low", "refused",
                 f"{wheel}: gets {100 * one.applied:.0f} % of the commanded voltage, as from a "
@@ -243,7 +243,7 @@ def supply(robot: Robot) -> Iterator[Finding]:
                 "charge or change the battery, or correct supply_voltage in motor_description",
             )  # fmt: skip
     rated = max((h.supply_voltage or math.nan for h in robot.hardware.values()), default=math.nan)
-    if robot.battery < (1.0 - MAX_SUPPLY_SHORTFALL.value) * rated:
+    if robot.battery < (1.0 - MAX_SUPPLY_SHORTFALL) * rated:
         yield Finding(
             "supply_low", "refused",
             f"battery_state says {robot.battery:.3g} V, motor_description {rated:g} V",
@@ -282,7 +282,7 @@ def _compare_with_others(
     for wheel, value in known.items():
         others = [v for w, v in known.items() if w != wheel]
         usual = float(np.median(others)) if len(others) > 1 else math.nan
-        if value > MAX_FRICTION_RATIO.value * usual:
+        if value > MAX_FRICTION_RATIO * usual:
             text = f"{wheel}: its {what} is {value / usual:.3g} times that of the others: {why}"
             evidence: dict[str, float | str | None] = {
                 "wheel": wheel, "value": value, "median": usual

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from smp_motor_control.arrays import Array, Flags
-from smp_motor_ident.commission.wheel_limits import (
+from smp_motor_ident.limits import (
     BREAKAWAY_COUNTS,
     MAX_FRICTION_SHARE,
     MAX_SUPPLY_SHORTFALL,
@@ -89,7 +89,7 @@ class Figures:
 
 def answers_well(level: float, breakaway: float, counts: float) -> bool:
     """Tell whether a wheel's response depends more on the motor than on friction."""
-    return level * MAX_FRICTION_SHARE.value >= breakaway and counts >= MIN_RESPONSE_COUNTS.value
+    return level * MAX_FRICTION_SHARE >= breakaway and counts >= MIN_RESPONSE_COUNTS
 
 
 def has_settled(hold: Trace) -> bool:
@@ -101,7 +101,7 @@ def has_settled(hold: Trace) -> bool:
     time, count = there.time, there.count
     span = float(np.ptp(time)) if time.size > 8 else 0.0
     command, voltage = (float(np.median(x[-8:])) for x in (there.command, there.voltage))
-    if span < MIN_HOLD_S or abs(voltage - command) > MAX_SUPPLY_SHORTFALL.value * abs(command):
+    if span < MIN_HOLD_S or abs(voltage - command) > MAX_SUPPLY_SHORTFALL * abs(command):
         return False
     thirds = np.interp(time[0] + span * np.arange(1, 4) / 3, time, count)
     before, last = np.abs(np.diff(thirds))
@@ -184,7 +184,7 @@ class _Steady:
         if late.time.size < 2 or late.time[-1] <= late.time[0]:
             return cls(math.nan, 0.0, 0.0, math.nan)
         voltage, angle = float(late.voltage.mean()), late.count * _angle_per_count(hardware)
-        if np.ptp(angle) < BREAKAWAY_COUNTS.value * _angle_per_count(hardware):
+        if np.ptp(angle) < BREAKAWAY_COUNTS * _angle_per_count(hardware):
             return cls(voltage, 0.0, 0.0, math.nan)
         speed = float((angle[-1] - angle[0]) / np.ptp(late.time))
         return cls(voltage, speed, speed / hardware.gear_ratio, float(late.velocity.mean()))
@@ -199,7 +199,7 @@ def _breakaway(ramp: Trace) -> float:
     if ramp.time.size < 2:
         return math.nan
     turned = np.abs(ramp.count - ramp.count[0])
-    if turned[-1] < BREAKAWAY_COUNTS.value:
+    if turned[-1] < BREAKAWAY_COUNTS:
         return math.nan
     still = np.flatnonzero(turned <= ENCODER_DITHER)
     return float(abs(ramp.command[still[-1]]))
@@ -209,7 +209,7 @@ def _coast(hold: Trace, coast: Trace, hardware: Hardware) -> float:
     steady, free = _Steady.of(hold, hardware), _held(coast)
     if not steady.speed or free.time.size < 2:
         return math.nan
-    if abs(float(np.median(free.voltage[-8:]))) > MAX_SUPPLY_SHORTFALL.value * abs(steady.voltage):
+    if abs(float(np.median(free.voltage[-8:]))) > MAX_SUPPLY_SHORTFALL * abs(steady.voltage):
         return math.nan  # a busy computer did not let go of it yet
     angle = free.count * _angle_per_count(hardware)
     return float((angle[-1] - angle[0]) / steady.speed)

@@ -22,8 +22,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from smp_motor_ident.commission.wheel_limits import MAX_RESISTANCE_RISE
 from smp_motor_ident.finding import Finding
+from smp_motor_ident.limits import MAX_RESISTANCE_RISE
 from smp_motor_ident.live.monitor import BLOCK_S, COPPER_COEFFICIENT
 from smp_motor_ident.record import Record
 
@@ -85,7 +85,7 @@ def report_heated_winding(wheel: str, earlier: Sequence[Record], last: Record) -
     cold = min(known, key=lambda r: r.std / r.value)
     rise = now.value / cold.value - 1.0
     std = math.hypot((1.0 + rise) * cold.std, now.std) / cold.value
-    if rise - MIN_DEVIATIONS * std <= MAX_RESISTANCE_RISE.value:
+    if rise - MIN_DEVIATIONS * std <= MAX_RESISTANCE_RISE:
         return []
     warmer = rise / COPPER_COEFFICIENT
     return [Finding(

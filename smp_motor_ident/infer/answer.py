@@ -20,10 +20,9 @@ from smp_motor_ident.chain.catalogue import component_of
 from smp_motor_ident.chain.quantities import HIDDEN, jacobian
 from smp_motor_ident.fit.data import Data
 from smp_motor_ident.fit.descend import Fit
-from smp_motor_ident.infer.instrument_limits import CURRENT_ACCURACY, ONE_SIZE_ACCURACY
 from smp_motor_ident.infer.levels import Levels
 from smp_motor_ident.infer.uncertainty import DRIVER_SLOTS, Contribution
-from smp_motor_ident.quality.limits import LOOSE_QUANTITY
+from smp_motor_ident.limits import CURRENT_ACCURACY, LOOSE_QUANTITY, ONE_SIZE_ACCURACY
 from smp_motor_ident.record import Hardware
 from smp_motor_ident.result import NORMAL_95, UNITS, Quantity, Share, Systematic
 
@@ -123,7 +122,7 @@ def _quantity(
     low = max(low, 0.0) if positive else low
     made = Quantity(value, std, (low, high), UNITS[name], "estimated", shares, valid)
     of_priors = math.hypot(std, *(s.size for s in shares if s.cause in CAUSES.values()))
-    loose = name in OPEN and of_priors > LOOSE_QUANTITY.value * abs(value)
+    loose = name in OPEN and of_priors > LOOSE_QUANTITY * abs(value)
     if loose or not math.isfinite(std):
         ends = made.total_ci95 or (low, high)
         return Quantity(None, None, (max(ends[0], 0.0), ends[1]), UNITS[name], "unidentifiable")
@@ -150,14 +149,14 @@ def _systematic(
         if component is not None and component.slot in DRIVER_SLOTS and levels.one_size:
             cause = "one_size_of_voltage"
             if hardware.voltage_accuracy is not None:
-                moves = moves * hardware.voltage_accuracy / ONE_SIZE_ACCURACY.value
+                moves = moves * hardware.voltage_accuracy / ONE_SIZE_ACCURACY
         share = _largest(moves, values)
         if share > LEAST_SHARE or part.adds:
             moved = dict(zip(names, map(float, moves))) | dict(part.adds)
             yield Systematic(cause, share, moved)
     if "ln_r" in found.names:
         accuracy = hardware.current_accuracy
-        share = CURRENT_ACCURACY.value if accuracy is None else accuracy
+        share = CURRENT_ACCURACY if accuracy is None else accuracy
         moves_of = {n: share * p * values[n] for n, p in BY_CURRENT.items() if n in values}
         yield Systematic("current_scale", share, moves_of)
 

@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from smp_motor_control.motor.parameters import PHYSICAL
+from smp_motor_ident import limits
 from smp_motor_ident.chain.component import Component, Parameter
 from smp_motor_ident.chain.quantities import REPORTED
 from smp_motor_ident.errors import CurrentError, InsufficientExcitationError, SignalError
@@ -22,8 +23,7 @@ from smp_motor_ident.infer.answer import BY_CURRENT, Answer
 from smp_motor_ident.infer.levels import Levels
 from smp_motor_ident.infer.uncertainty import Contribution
 from smp_motor_ident.infer.validation import explained, white_share
-from smp_motor_ident.quality import limits
-from smp_motor_ident.quality.sample_limits import FRICTION_MOST
+from smp_motor_ident.limits import FRICTION_MOST
 from smp_motor_ident.quality.screen import where_of
 from smp_motor_ident.quality.units import implausible_motor
 from smp_motor_ident.record import Record
@@ -81,14 +81,14 @@ class Judged:
         """Whether the residual is no more than the resolution of the sensor."""
         own = self.data.quantum / math.sqrt(12)
         left = self.data.motion - self.found.motion
-        return own > 0 and float(np.nanstd(left)) < math.sqrt(limits.UNEXPLAINED.value) * own
+        return own > 0 and float(np.nanstd(left)) < math.sqrt(limits.UNEXPLAINED) * own
 
 
 def refuse(judged: Judged) -> None:
     """Refuse an estimate that does not explain the recording."""
     fitted = max(judged.percent.estimation or 0.0, explained(judged.data, judged.found.motion))
     where = where_of(judged.group)
-    enough = fitted >= limits.WORST_FIT.value or judged.within_resolution
+    enough = fitted >= limits.WORST_FIT or judged.within_resolution
     if not enough and not _nearly_constant(judged):
         if white_share(judged.data) > STANDING:
             raise InsufficientExcitationError(
@@ -103,7 +103,7 @@ def refuse(judged: Judged) -> None:
     offset = abs(judged.found.chain.values.get("current_offset", 0.0))
     if offset and judged.data.current is not None:
         largest = float(np.nanmax(np.abs(judged.data.current)))
-        if offset > limits.LARGEST_OFFSET.value * max(largest - offset, 1e-12):
+        if offset > limits.LARGEST_OFFSET * max(largest - offset, 1e-12):
             raise CurrentError(
                 f"{where}: current has an offset of {offset:.3g} A where it reaches "
                 f"{largest:.3g} A; zero the current sensor at rest and record again"
@@ -124,7 +124,7 @@ def _refuse_angle(where: str, group: Sequence[Record]) -> None:
     data = prepare(angles, use_current=False)
     for chain in guesses(data, 1):
         found = fit(data, approach(data, chain, data.scales(1.0), data.initial), rounds=1)
-        if explained(data, found.motion) > limits.FIT_EXPLAINS.value:
+        if explained(data, found.motion) > limits.FIT_EXPLAINS:
             raise SignalError(
                 f"{where}: the speed follows the voltage as an angle does; map it as position"
             )
@@ -158,17 +158,17 @@ def findings_of(judged: Judged) -> list[Finding]:
 def _fit(judged: Judged) -> Iterator[Finding]:
     estimation, validation = judged.percent.estimation or 0.0, judged.percent.validation
     estimation = max(estimation, explained(judged.data, judged.found.motion))
-    if estimation < limits.FIT_EXPLAINS.value and not judged.within_resolution:
+    if estimation < limits.FIT_EXPLAINS and not judged.within_resolution:
         yield Finding(
             "poor_fit", "unreliable",
             f"the model explains {estimation:.0f} % of the speed; at least "
-            f"{limits.FIT_EXPLAINS.value:.0f} % are expected",
-            {"fit_percent": estimation, "limit": limits.FIT_EXPLAINS.value},
+            f"{limits.FIT_EXPLAINS:.0f} % are expected",
+            {"fit_percent": estimation, "limit": limits.FIT_EXPLAINS},
             "look for a second cause of the motion, such as a load, and record the driver's output "
             "voltage",
         )  # fmt: skip
     fitted = judged.percent.estimation or 0.0
-    falls = validation is not None and validation < fitted - limits.FIT_HOLDS.value
+    falls = validation is not None and validation < fitted - limits.FIT_HOLDS
     if falls and not judged.within_resolution:
         yield Finding(
             "validation", "unreliable",
@@ -218,7 +218,7 @@ def _lag_unknown(judged: Judged) -> Iterator[Finding]:
 
 def _friction_dominates(judged: Judged) -> Iterator[Finding]:
     static = judged.quantity("static_voltage")
-    if static is None or (static.value or 0.0) <= FRICTION_MOST.value * judged.top:
+    if static is None or (static.value or 0.0) <= FRICTION_MOST * judged.top:
         return
     yield Finding(
         "friction_dominates", "unreliable",
@@ -385,7 +385,7 @@ def _current_scale(judged: Judged) -> Iterator[Finding]:
         )  # fmt: skip
         return
     scale = ohmmeter / found.value
-    far = limits.RESISTANCE_BAND.value + limits.HALF_WIDTH.value * (found.std or 0.0) / found.value
+    far = limits.RESISTANCE_BAND + limits.HALF_WIDTH * (found.std or 0.0) / found.value
     off = abs(scale - 1) > far
     yield Finding(
         "current_scale", "unreliable" if off else "note",

@@ -10,7 +10,7 @@ import numpy as np
 from smp_motor_control.arrays import Array
 from smp_motor_ident.fit.data import Data
 from smp_motor_ident.fit.start import command_of
-from smp_motor_ident.quality.limits import REST, SAME_LEVEL
+from smp_motor_ident.limits import REST, SAME_LEVEL
 
 MIN_SWINGS = 6
 MANY_CHANGES = 0.2  # share of the rows: a command that changes in more of them makes no steps
@@ -49,7 +49,7 @@ def _coasts(data: Data) -> bool:
 def _only_size(command: Array) -> float:
     """Return the only size of a command besides zero; a row between two levels is no third."""
     top = float(np.abs(command).max())
-    other = (top - np.abs(command) > SAME_LEVEL.value * top) & (np.abs(command) > REST.value * top)
+    other = (top - np.abs(command) > SAME_LEVEL * top) & (np.abs(command) > REST * top)
     change = np.diff(command)
     between = (change[:-1] * change[1:] > 0) & ~other[:-2] & ~other[2:]
     other[1:-1] &= ~between
@@ -65,17 +65,17 @@ def _only_swing(data: Data) -> float:
     peaks = np.maximum.reduceat(np.abs(command), turns)[:-1]
     lengths = np.diff(begin[turns])
     peak, length = float(np.median(peaks)), float(np.median(lengths))
-    alike = (np.abs(peaks - peak) < SAME_LEVEL.value * peak) & (
-        np.abs(lengths - length) < SAME_LEVEL.value * length + 1.5 * data.rows.step
+    alike = (np.abs(peaks - peak) < SAME_LEVEL * peak) & (
+        np.abs(lengths - length) < SAME_LEVEL * length + 1.5 * data.rows.step
     )
-    return peak if float(alike.mean()) > 1 - SAME_LEVEL.value else 0.0
+    return peak if float(alike.mean()) > 1 - SAME_LEVEL else 0.0
 
 
 def _only_step(command: Array) -> float:
     change = np.abs(np.diff(command))
-    steps = change[change > REST.value * float(np.abs(command).max())]
+    steps = change[change > REST * float(np.abs(command).max())]
     if not MIN_SWINGS <= steps.size < MANY_CHANGES * change.size:
         return 0.0
     size = float(np.median(steps))
-    alike = np.abs(steps - size) < SAME_LEVEL.value * size
-    return size if float(alike.mean()) > 1 - SAME_LEVEL.value else 0.0
+    alike = np.abs(steps - size) < SAME_LEVEL * size
+    return size if float(alike.mean()) > 1 - SAME_LEVEL else 0.0

@@ -19,7 +19,7 @@ from smp_motor_ident.fit.data import Data
 from smp_motor_ident.fit.descend import Fit
 from smp_motor_ident.fit.start import command_of
 from smp_motor_ident.infer.unmodelled import estimate_model_error
-from smp_motor_ident.quality.limits import RESIDUAL_LEVEL
+from smp_motor_ident.limits import RESIDUAL_LEVEL
 from smp_motor_ident.result import Correlation, ModelError, ResidualTests
 
 LAGS = 25  # rows up to which correlations are looked at
@@ -70,7 +70,7 @@ def _centre(error: Array) -> tuple[Array, float]:
     if n < 4 * LAGS:
         return np.zeros(LAGS + 1), np.inf
     e = np.where(ok, error - error[ok].mean(), 0.0)[:MAX_ROWS]
-    return e, NormalDist().inv_cdf(1 - RESIDUAL_LEVEL.value / 2 / LAGS) / math.sqrt(n)
+    return e, NormalDist().inv_cdf(1 - RESIDUAL_LEVEL / 2 / LAGS) / math.sqrt(n)
 
 
 def _lagged(a: Array, b: Array) -> Array:

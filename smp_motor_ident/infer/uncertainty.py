@@ -30,8 +30,8 @@ from smp_motor_ident.fit.search import (
     relabelled,
     typical_size,
 )
-from smp_motor_ident.infer.instrument_limits import TIMING_ACCURACY
 from smp_motor_ident.infer.levels import Levels
+from smp_motor_ident.limits import TIMING_ACCURACY
 
 SUPPORTED = 0.1  # probability from which a component is part of the random uncertainty
 KNOWN = 100.0  # squared ratio of prior and posterior width from which the data show a size
@@ -70,7 +70,7 @@ def contributions(
     share = seen.linear.row.size / found.linear.row.size
     parts += considered(some, seen, bool(levels.one_size), 1 / share)
     parts += of_relabelled(some, seen)
-    seconds = TIMING_ACCURACY.value * data.sample if timing is None else timing
+    seconds = TIMING_ACCURACY * data.sample if timing is None else timing
     parts += of_timing(some, seen, seconds)
     return parts
 

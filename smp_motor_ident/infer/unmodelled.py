@@ -38,7 +38,7 @@ from typing import Any
 import numpy as np
 
 from smp_motor_control.arrays import Array, Complex, Integers
-from smp_motor_ident.infer.response_limits import (
+from smp_motor_ident.limits import (
     BAND_LEVEL,
     BAND_LINES,
     BAND_WIDTH,
@@ -81,7 +81,7 @@ def estimate_model_error(
     lines = [
         _spectra(error[a:b], [one[a:b] for one in outputs], is_angle, step)
         for a, b in pairwise(segment)
-        if np.isfinite(error[a:b]).sum() > 2 * BAND_LINES.value + FIRST
+        if np.isfinite(error[a:b]).sum() > 2 * BAND_LINES + FIRST
     ]
     if not lines:
         return None
@@ -131,7 +131,7 @@ def relative_error(omega: Array, error: Complex, output: Complex) -> ModelError 
 def _filters(omega: Array) -> Complex:
     """Return trial responses of a band as rows: unity, and resonances."""
     span = float(np.log(omega[-1] / omega[0]))
-    n = max(round(span / (2 * RESONANCE_DAMPING.value)), 1)
+    n = max(round(span / (2 * RESONANCE_DAMPING)), 1)
     at = omega[0] * np.exp(span * (np.arange(n)[:, None] + 0.5) / n)
     return np.vstack([np.ones(omega.size), _resonance(omega, at)])
 
@@ -139,7 +139,7 @@ def _filters(omega: Array) -> Complex:
 def _most_shown(error: Complex, outputs: Complex) -> tuple[float, float]:
     """Return size and radius of a band's error: of its mean, or of a resonance's peak."""
     n = len(outputs) - 1
-    size, radius = _circles(error, outputs, BAND_LEVEL.value / np.array([1, *[n] * n]))
+    size, radius = _circles(error, outputs, BAND_LEVEL / np.array([1, *[n] * n]))
     surely = size - radius
     most = 1 + int(np.argmax(surely[1:]))
     most = most if surely[most] > max(surely[0], 0.0) else 0
@@ -171,16 +171,16 @@ def _power(rows: Complex) -> Array:
 
 def _resonance(omega: Array, at: Array) -> Complex:
     """Return the response of a resonance, 1 at its peak."""
-    width = 2j * RESONANCE_DAMPING.value * at * omega
+    width = 2j * RESONANCE_DAMPING * at * omega
     response: Complex = width / (at**2 - omega**2 + width)
     return response
 
 
 def _bands(omega: Array) -> Iterator[tuple[int, int]]:
     """Yield the first and the one after the last line of each band."""
-    begin, least = 0, int(BAND_LINES.value)
+    begin, least = 0, int(BAND_LINES)
     while begin + least <= omega.size:
-        end = int(np.searchsorted(omega, omega[begin] * BAND_WIDTH.value))
+        end = int(np.searchsorted(omega, omega[begin] * BAND_WIDTH))
         end = max(end, begin + least)
         if omega.size - end < least:
             end = omega.size

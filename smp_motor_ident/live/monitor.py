@@ -24,9 +24,9 @@ from typing import Literal
 import numpy as np
 
 from smp_motor_control.arrays import Array
+from smp_motor_ident import limits
 from smp_motor_ident.errors import ParameterError
 from smp_motor_ident.finding import Finding
-from smp_motor_ident.quality import limits
 from smp_motor_ident.result import Estimate
 
 Validity = Literal["unestimated", "estimated", "invalid"]
@@ -225,7 +225,7 @@ class Monitor:
         band = {"resistance": limits.RESISTANCE_BAND, "motor_constant": limits.MOTOR_CONSTANT_BAND,
                 "friction": limits.FRICTION_BAND}  # fmt: skip
         return {
-            name: (value / usual[name] - 1.0, std / usual[name], band[name].value)
+            name: (value / usual[name] - 1.0, std / usual[name], band[name])
             for name, (value, std) in now.items()
         }
 
@@ -246,7 +246,7 @@ class Monitor:
     def _judge(self) -> None:
         """Store since when, in time of motion, each value is significantly out of its band."""
         for name, (share, std, band) in self._shares().items():
-            if abs(share) - band > limits.HALF_WIDTH.value * std:
+            if abs(share) - band > limits.HALF_WIDTH * std:
                 self._outside.setdefault(name, self._clock)
             elif abs(share) < band:
                 self._outside.pop(name, None)
@@ -258,7 +258,7 @@ class Monitor:
         out = {
             name: shares[name][0]
             for name, since in self._outside.items()
-            if self._clock - since >= limits.LEFT_BAND.value and known[name][0] == "estimated"
+            if self._clock - since >= limits.LEFT_BAND and known[name][0] == "estimated"
         }
         return [_finding(name, share, out) for name, share in out.items()]
 

@@ -23,9 +23,16 @@ import numpy as np
 
 from smp_motor_control.arrays import Array
 from smp_motor_ident.finding import Finding
-from smp_motor_ident.quality.limits import FEWEST, NEIGHBOURS, ONE_COUNT, SIGN_SURE
+from smp_motor_ident.limits import (
+    BEAT_JITTER,
+    COUNTS_A_SAMPLE,
+    FEWEST,
+    NEIGHBOURS,
+    NOMINAL_PERIOD,
+    ONE_COUNT,
+    SIGN_SURE,
+)
 from smp_motor_ident.quality.resolution import speed_quantum
-from smp_motor_ident.quality.sample_limits import BEAT_JITTER, COUNTS_A_SAMPLE, NOMINAL_PERIOD
 from smp_motor_ident.record import Record
 
 SMOOTH = 9  # samples of a moving mean that keeps the motion and removes the rounding
@@ -84,7 +91,7 @@ def _smooth_but_for_one(moved: Array) -> bool:
 
     Of more than a few counts a sample the speed itself can be read, whatever else moves the motor.
     """
-    if moved.size < LOCAL or np.abs(moved).max() > COUNTS_A_SAMPLE.value:
+    if moved.size < LOCAL or np.abs(moved).max() > COUNTS_A_SAMPLE:
         return False
     count = np.cumsum(moved)
     from scipy.signal import savgol_coeffs, savgol_filter  # takes a while to load
@@ -92,7 +99,7 @@ def _smooth_but_for_one(moved: Array) -> bool:
     rest = count - savgol_filter(count, LOCAL, 3)
     turns = np.convolve(moved != 0, np.ones(LOCAL), "same") > 1
     left = 1 - float(savgol_coeffs(LOCAL, 3)[LOCAL // 2])  # of a white error
-    return bool(turns.any() and np.mean(np.square(rest[turns])) < ONE_COUNT.value * left / 12)
+    return bool(turns.any() and np.mean(np.square(rest[turns])) < ONE_COUNT * left / 12)
 
 
 def _against_each_other(moved: Array) -> bool:
@@ -100,7 +107,7 @@ def _against_each_other(moved: Array) -> bool:
     smooth = np.convolve(moved, np.full(SMOOTH, 1 / SMOOTH), "same")
     rest = (moved - smooth)[SMOOTH:-SMOOTH]
     size = float(rest @ rest)
-    return size > 0.0 and float(rest[1:] @ rest[:-1]) < NEIGHBOURS.value * size
+    return size > 0.0 and float(rest[1:] @ rest[:-1]) < NEIGHBOURS * size
 
 
 def over_real_intervals(record: Record) -> Record:
@@ -149,7 +156,7 @@ def _as_intervals(velocity: Array, interval: Array) -> bool:
     """
     known = np.isfinite(velocity) & np.isfinite(interval)
     speed, took = velocity[known], interval[known]
-    if speed.size < FEWEST.value or np.std(took) < BEAT_JITTER.value * np.median(took):
+    if speed.size < FEWEST or np.std(took) < BEAT_JITTER * np.median(took):
         return False
     took = np.minimum(took, LONGER * np.median(took))  # the motion in a gap is unknown
     window = np.full(SMOOTH, 1 / SMOOTH)
@@ -161,4 +168,4 @@ def _as_intervals(velocity: Array, interval: Array) -> bool:
         return False
     slope = float(x @ y) / power
     std = float(np.linalg.norm((y - slope * x) * x)) / power
-    return slope - SIGN_SURE.value * std > NOMINAL_PERIOD.value
+    return slope - SIGN_SURE * std > NOMINAL_PERIOD

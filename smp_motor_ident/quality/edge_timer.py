@@ -15,9 +15,8 @@ import numpy as np
 
 from smp_motor_control.arrays import Array, Flags, Integers
 from smp_motor_ident.finding import Finding
-from smp_motor_ident.quality.limits import HALF_EXPLAINED
+from smp_motor_ident.limits import EDGE_SPEED, EDGES, HALF_EXPLAINED, HELD
 from smp_motor_ident.quality.resolution import speed_quantum
-from smp_motor_ident.quality.sample_limits import EDGE_SPEED, EDGES, HELD
 from smp_motor_ident.record import Record
 
 ROWS = 2.05  # shortest holding time that identifies a count [rows]
@@ -62,7 +61,7 @@ def _count_of(record: Record, velocity: Array) -> float:
     known = np.flatnonzero(np.isfinite(velocity))
     speed, when = velocity[known], record.time[known]
     at = np.flatnonzero(np.diff(speed) != 0) + 1
-    if at.size < EDGES.value:
+    if at.size < EDGES:
         return 0.0
     held, after = np.diff(when[at]), np.abs(speed[at[1:]])
     held, after = held[after > 0], after[after > 0]
@@ -71,14 +70,14 @@ def _count_of(record: Record, velocity: Array) -> float:
         return 2 * np.pi / per_turn
     step = record.sample_time
     tells = held > ROWS * step
-    best, most = 0.0, EDGES.value - 1
-    least = EDGE_SPEED.value * ROWS * step * float(np.abs(speed).max())
+    best, most = 0.0, EDGES - 1
+    least = EDGE_SPEED * ROWS * step * float(np.abs(speed).max())
     for count in np.percentile((held * after)[tells], TRIED) if tells.any() else ():
         slow = count / after > ROWS * step
         alike = np.abs(held - count / after)[slow] < ALIKE * step
-        if count < least or np.unique(after[slow]).size < HALF_EXPLAINED.value * alike.size:
+        if count < least or np.unique(after[slow]).size < HALF_EXPLAINED * alike.size:
             continue  # levels of a rounded speed
-        if alike.sum() > most and alike.mean() > HELD.value:
+        if alike.sum() > most and alike.mean() > HELD:
             best, most = float(count), int(alike.sum())
     return best
 
@@ -86,7 +85,7 @@ def _count_of(record: Record, velocity: Array) -> float:
 def _ticks(period: Array) -> bool:
     """Tell whether times of a count are whole microseconds, the ticks of usual timers."""
     rest = period / TICK - np.rint(period / TICK)
-    return bool(np.mean(np.abs(rest) < NEAR) > HELD.value)
+    return bool(np.mean(np.abs(rest) < NEAR) > HELD)
 
 
 def _centre(record: Record, velocity: Array, count: float) -> tuple[Array, float]:

@@ -8,8 +8,7 @@ import numpy as np
 
 from smp_motor_control.arrays import Array
 from smp_motor_ident.finding import Finding
-from smp_motor_ident.quality.limits import FEWEST, REST
-from smp_motor_ident.quality.sample_limits import EXCERPT
+from smp_motor_ident.limits import EXCERPT, FEWEST, REST
 from smp_motor_ident.record import Record
 
 STRETCHES = 8
@@ -29,7 +28,7 @@ def _scatter(values: Array) -> float:
 
 def excitation(record: Record) -> tuple[int, int]:
     """Return the rows from a record's first to its last excitation, as of `Record.slice`."""
-    moves = np.abs(record.voltage) > REST.value * np.abs(record.voltage).max()
+    moves = np.abs(record.voltage) > REST * np.abs(record.voltage).max()
     for name in ("velocity", "position", "count"):
         values = getattr(record, name)
         if values is None:
@@ -37,7 +36,7 @@ def excitation(record: Record) -> tuple[int, int]:
         y = np.where(np.isfinite(values), values, 0.0)
         y = y if name == "velocity" else np.diff(y, prepend=y[0])
         noise = 0.0 if name == "count" else _scatter(y)
-        moves |= np.abs(y) > max(REST.value * float(np.abs(y).max()), SCATTER * noise)
+        moves |= np.abs(y) > max(REST * float(np.abs(y).max()), SCATTER * noise)
         break
     busy = np.flatnonzero(moves)
     # A rest shorter than the excitation does not hide it, and shows the sensor's noise.
@@ -47,14 +46,14 @@ def excitation(record: Record) -> tuple[int, int]:
     return max(0, int(busy[0]) - MARGIN), min(len(record), int(busy[-1]) + MARGIN + 1)
 
 
-def excerpts(records: Sequence[Record], most: int = round(EXCERPT.value)) -> list[Record]:
+def excerpts(records: Sequence[Record], most: int = round(EXCERPT)) -> list[Record]:
     """Return evenly spread stretches of records that have more than ``most`` rows in all."""
     rows = sum(map(len, records))
     count = -(-STRETCHES // len(records)) if records else 0
     parts: list[Record] = []
     for record in records:
         length = most * len(record) // (rows * count)
-        if rows <= most or length < FEWEST.value:
+        if rows <= most or length < FEWEST:
             parts.append(record)
         else:
             parts += _stretches(record, count, length)

@@ -13,7 +13,7 @@ import numpy as np
 
 from smp_motor_control.arrays import Array, Flags
 from smp_motor_ident.finding import Finding
-from smp_motor_ident.quality.sample_limits import GLITCH, GLITCHES
+from smp_motor_ident.limits import GLITCH, GLITCHES
 from smp_motor_ident.record import Record
 
 SHARE = 0.05  # of the signal's range, and of the voltage's: less is no glitch, and no pulse
@@ -32,7 +32,7 @@ def without_glitches(record: Record) -> Record:
         if values is None:
             continue
         wrong = _glitches(values, pulsed)
-        if not wrong.any() or wrong.mean() > GLITCHES.value:
+        if not wrong.any() or wrong.mean() > GLITCHES:
             continue
         first = int(np.argmax(wrong))
         found = Finding(
@@ -65,7 +65,7 @@ def _glitches(values: Array, pulsed: Flags) -> Flags:
         low, high = np.percentile(values[at][some], (1, 99))
         moves = np.abs(np.diff(values[at]))[some]
         least = max(
-            GLITCH.value * float(np.percentile(beyond[some], 75)),
+            GLITCH * float(np.percentile(beyond[some], 75)),
             CHANGES * float(np.median(moves[moves > 0])) if moves.any() else 0.0,
             SHARE * float(high - low),
         )

@@ -6,10 +6,10 @@ from collections.abc import Iterator
 import numpy as np
 
 from smp_motor_control.arrays import Array, Flags
+from smp_motor_ident import limits
 from smp_motor_ident.errors import SignalError
 from smp_motor_ident.finding import Finding
-from smp_motor_ident.quality import limits
-from smp_motor_ident.quality.sample_limits import REGULATED
+from smp_motor_ident.limits import REGULATED
 from smp_motor_ident.record import Record
 
 SMOOTH = 9  # samples of a moving mean that keeps the motion of a speed from counts
@@ -41,12 +41,12 @@ def saturation(record: Record, speed: Array, where: str) -> Iterator[Finding]:
             if share < 0.01 or at.sum() < 5 * next_times or runs.sum() < 0.5 * at.sum():
                 continue
             # The last samples of a rest may be late, of a voltage that has moved since.
-            late = int(limits.LATE_ROWS.value)
+            late = int(limits.LATE_ROWS)
             early = at & np.append(at[late:], [False] * late)
-            if early.sum() < limits.AT_LIMIT.value:
+            if early.sum() < limits.AT_LIMIT:
                 continue
             low, high = np.percentile(v[early], [5, 95])
-            if high - low < 10 * limits.METER.value * np.ptp(v) and not _abrupt(x, at):
+            if high - low < 10 * limits.METER * np.ptp(v) and not _abrupt(x, at):
                 continue
             if name == "current" and _holds(record.current == limit, record.voltage, speed):
                 regulated = max(regulated, abs(float(limit)))
@@ -83,13 +83,13 @@ def _holds(rests: Flags, voltage: Array, speed: Array) -> bool:
     v, w = voltage[rests], smooth[rests]
     v, w = v - v.mean(), w - w.mean()
     both = float(v @ w)
-    return both > 0 and both**2 > REGULATED.value * float((v @ v) * (w @ w))
+    return both > 0 and both**2 > REGULATED * float((v @ v) * (w @ w))
 
 
 def _one_level(v: Array) -> bool:
     """Tell whether the motor is driven by one level of voltage, at which it may come to rest."""
-    driven = v[np.abs(v) > limits.REST.value * np.abs(v).max()]
-    return not driven.size or bool(np.ptp(driven) < 10 * limits.METER.value * np.abs(driven).max())
+    driven = v[np.abs(v) > limits.REST * np.abs(v).max()]
+    return not driven.size or bool(np.ptp(driven) < 10 * limits.METER * np.abs(driven).max())
 
 
 def _abrupt(x: Array, at: Flags) -> bool:

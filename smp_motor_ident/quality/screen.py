@@ -6,9 +6,9 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from smp_motor_control.arrays import Array
+from smp_motor_ident import limits
 from smp_motor_ident.errors import CurrentError, InsufficientExcitationError, SignalError
 from smp_motor_ident.finding import Finding
-from smp_motor_ident.quality import limits
 from smp_motor_ident.quality.edge_timer import held_of
 from smp_motor_ident.quality.glitches import count_glitches
 from smp_motor_ident.quality.saturation import saturation
@@ -66,11 +66,11 @@ def where_of(records: Sequence[Record]) -> str:
 
 def _length(records: Sequence[Record], where: str) -> None:
     samples = sum(len(r) for r in records)
-    if samples < limits.FEWEST.value:
+    if samples < limits.FEWEST:
         duration = sum(r.duration for r in records)
         raise InsufficientExcitationError(
             f"{where}: too short, {samples} samples in {duration:.3g} s; record at least "
-            f"{limits.FEWEST.value:.0f} samples (faster, or the same again), better 20 s or more "
+            f"{limits.FEWEST:.0f} samples (faster, or the same again), better 20 s or more "
             "with a changing voltage"
         )
 
@@ -83,7 +83,7 @@ def _lost(record: Record) -> Iterator[Finding]:
             continue
         lost = float(np.mean(~np.isfinite(values)))
         lost -= held_of(record) if name == "velocity" else 0.0  # which is said already
-        if lost > limits.MOST_LOST.value and (name == "velocity" or record.velocity is None):
+        if lost > limits.MOST_LOST and (name == "velocity" or record.velocity is None):
             raise SignalError(
                 f"{where}: {name} is NaN in {100 * lost:.0f} % of the samples; "
                 "repair the sensor or its connection and record again"
@@ -105,7 +105,7 @@ def _report_left_out(name: str, lost: float) -> Finding:
 def _excitation(records: Sequence[Record], where: str) -> None:
     largest = max(float(np.abs(r.voltage).max()) for r in records)
     supply = max(r.hardware.supply_voltage or 0.0 for r in records)
-    if largest <= limits.METER.value * supply:
+    if largest <= limits.METER * supply:
         raise InsufficientExcitationError(
             f"{where}: no excitation, the voltage stays within {largest:.3g} V of 0 V; drive the "
             "motor with a sine, square or Fourier voltage while recording"
@@ -113,13 +113,13 @@ def _excitation(records: Sequence[Record], where: str) -> None:
     # A voltmeter's scatter around a level is not an excitation; a step is one.
     levels = [float(np.mean(r.voltage)) for r in records]
     still = [
-        float(np.std(r.voltage)) < limits.METER.value * abs(level)
-        and float(np.ptp(r.voltage)) < 10 * limits.METER.value * abs(level)
+        float(np.std(r.voltage)) < limits.METER * abs(level)
+        and float(np.ptp(r.voltage)) < 10 * limits.METER * abs(level)
         for r, level in zip(records, levels, strict=True)
     ]
     if (
         all(still)
-        and float(np.ptp(levels)) < limits.METER.value * abs(levels[0])
+        and float(np.ptp(levels)) < limits.METER * abs(levels[0])
         and not any(_starts(r) for r in records)
     ):
         raise InsufficientExcitationError(
@@ -139,7 +139,7 @@ def _starts(record: Record) -> bool:
     """
     speed = measured_speed(record)
     speed = speed[np.isfinite(speed)]
-    if speed.size < limits.FEWEST.value:
+    if speed.size < limits.FEWEST:
         return False
     length = 1
     while speed.size // length >= LEAST_MEANS:
@@ -254,22 +254,17 @@ def _signs(records: Sequence[Record], where: str, late: bool = True) -> None:
         found = likeness(kept, [s for s in signals if s is not None], lags=what == "speed")
         if found is None:
             continue
-        sure = limits.SIGN_SURE.value * found.chance
+        sure = limits.SIGN_SURE * found.chance
         # Samples of a current between switched voltages show little of it because of the lag.
-        least = (limits.SIGN_LEAST if what == "speed" else limits.SIGN_ALIKE).value
-        if found.wrong - found.right > max(least, min(sure, limits.SIGN_ALIKE.value * found.wrong)):
+        least = limits.SIGN_LEAST if what == "speed" else limits.SIGN_ALIKE
+        if found.wrong - found.right > max(least, min(sure, limits.SIGN_ALIKE * found.wrong)):
             refusal = SignalError if what == "speed" else CurrentError
             raise refusal(
                 f"{where}: swapped sign, {what} runs against the voltage "
                 f"(correlation {-found.wrong:.2f}); {remedy}"
             )
-        follows = found.wrong > max(least, min(sure, limits.SIGN_ALIKE.value))
-        if (
-            late
-            and what == "speed"
-            and follows
-            and found.wrong > limits.SIGN_NEARER.value * found.right
-        ):
+        follows = found.wrong > max(least, min(sure, limits.SIGN_ALIKE))
+        if late and what == "speed" and follows and found.wrong > limits.SIGN_NEARER * found.right:
             raise InsufficientExcitationError(
                 f"{where}: the voltage changes too fast, with a period of {_period(records):.2g} "
                 "samples: a speed delayed by sampling, a filter or a window cannot be told from "
@@ -283,7 +278,7 @@ def _turning(records: Sequence[Record]) -> list[Record]:
     return [
         r
         for r, s in zip(records, scatter, strict=True)
-        if len(records) > 1 and s > limits.REST.value * max(scatter)
+        if len(records) > 1 and s > limits.REST * max(scatter)
     ]
 
 

@@ -13,14 +13,14 @@ from numpy.fft import irfft, rfft
 
 from smp_motor_control.arrays import Array
 from smp_motor_ident.errors import SignalError
-from smp_motor_ident.quality.lag import lagged
-from smp_motor_ident.quality.limits import (
+from smp_motor_ident.limits import (
     BACKWARD,
     HALF_EXPLAINED,
     SIGN_LATE,
     SIGN_LEAST,
     SIGN_SURE,
 )
+from smp_motor_ident.quality.lag import lagged
 from smp_motor_ident.record import Record
 
 LAGS = 16  # from a sampling interval to a quarter of the record, each 1.5 to 2 times the last
@@ -57,7 +57,7 @@ def likeness(records: Sequence[Record], signals: Sequence[Array], lags: bool) ->
         late = [(lagged(v, lag / step), y) for step, v, y in fewer]
         products = [
             sum(float(x[: x.size - k] @ y[k:]) for x, y in late)
-            for k in range(int(SIGN_LATE.value / every) + 1)
+            for k in range(int(SIGN_LATE / every) + 1)
         ]
         square = sum(float(x @ x) for x, _ in late)
         next_to = sum(float(2 * (x[1:] @ x[:-1]) - x[-1] ** 2) for x, _ in late)
@@ -69,7 +69,7 @@ def likeness(records: Sequence[Record], signals: Sequence[Array], lags: bool) ->
         for alike, half in ((whole, 1), (both, 2)):
             if alike.min(initial=0.0) < worst:
                 worst, reverse = float(alike.min()), [(_means(x, half), y) for x, y in late]
-    if -worst <= SIGN_LEAST.value:  # then nobody asks what chance would make of it
+    if -worst <= SIGN_LEAST:  # then nobody asks what chance would make of it
         return Likeness(best, -worst, np.inf)
     sizes = [float(np.sqrt((x @ x) * (y @ y))) for x, y in reverse]
     spread = [size * _chance(x, y) for size, (x, y) in zip(sizes, reverse, strict=True)]
@@ -123,7 +123,7 @@ def refuse_lost_sign(records: Sequence[Record], speeds: Sequence[Array], where: 
     lowest = min(float(np.nanmin(r.voltage)) for r in records)
     ways = np.concatenate([_ways(r, w) for r, w in zip(records, speeds, strict=True)])
     way, back = float(np.abs(ways).sum()), -float(np.minimum(ways, 0.0).sum())
-    if lowest >= 0 and back > BACKWARD.value * way and way - back > BACKWARD.value * way:
+    if lowest >= 0 and back > BACKWARD * way and way - back > BACKWARD * way:
         raise SignalError(
             f"{where}: the voltage is never negative, though {100 * back / way:.0f} % of the way "
             "is backwards: it has no sign; map its direction with direction=COLUMN, or record a "
@@ -144,7 +144,7 @@ def _ways(record: Record, speed: Array) -> Array:
     squares = np.add.reduceat(np.square(np.diff(speed, prepend=speed[:1])), starts)
     # The errors of all speeds add up, of the differences of angles those at the two ends.
     share = 1 / np.diff(starts, append=speed.size) if record.velocity is None else 0.5
-    return np.where(np.abs(ways) > SIGN_SURE.value * np.sqrt(squares * share), ways, 0.0)
+    return np.where(np.abs(ways) > SIGN_SURE * np.sqrt(squares * share), ways, 0.0)
 
 
 def _size_of(record: Record) -> bool:
@@ -160,7 +160,7 @@ def _size_of(record: Record) -> bool:
         made = lagged(volts, float(lag))[known]
         found.append([_share(x, speed[known]) for x in (made, np.abs(made))])
     signed, size = np.max(found, axis=0)
-    return bool(size > HALF_EXPLAINED.value and signed < HALF_EXPLAINED.value * size)
+    return bool(size > HALF_EXPLAINED and signed < HALF_EXPLAINED * size)
 
 
 def _share(x: Array, y: Array) -> float:

@@ -11,9 +11,8 @@ from smp_motor_control.arrays import Array, Flags
 from smp_motor_ident._compile import compiled
 from smp_motor_ident.errors import SignalError
 from smp_motor_ident.finding import Finding
+from smp_motor_ident.limits import FEWEST, FLICKER, LEFT_BY_SILENCE, SILENT_SWING
 from smp_motor_ident.quality.lag import lagged
-from smp_motor_ident.quality.limits import FEWEST, FLICKER, SILENT_SWING
-from smp_motor_ident.quality.sample_limits import LEFT_BY_SILENCE
 from smp_motor_ident.record import Record
 
 LAGS = 12  # between a sampling interval and a quarter of the record, from which a descent starts
@@ -36,7 +35,7 @@ def remove_silences(record: Record) -> Record:
 
     The rest determines the motor, whether the shaft was blocked or the encoder came loose.
     """
-    least = LEFT_BY_SILENCE.value * len(record)
+    least = LEFT_BY_SILENCE * len(record)
     while found := next((s for s in _silences(record) if s[2] + 1 < len(record)), None):
         name, a, b = found
         rows = np.ones(len(record), dtype=np.bool_)
@@ -86,7 +85,7 @@ def _silences(record: Record) -> Iterator[tuple[str, int, int]]:
         still, rest = record.voltage[a + 1 : b], np.delete(record.voltage, np.arange(a, b))
         if np.abs(still).mean() <= 0.5 * np.abs(rest).mean():
             continue
-        if _swing(record, name, a, b) > SILENT_SWING.value:
+        if _swing(record, name, a, b) > SILENT_SWING:
             yield name, a, b
 
 
@@ -104,14 +103,14 @@ def _swing(record: Record, name: str, a: int, b: int) -> float:
     known = np.isfinite(speed)
     known[a : b + 1] = False
     known[list(record.starts)] = False
-    if known.sum() < FEWEST.value or not levels.size:
+    if known.sum() < FEWEST or not levels.size:
         return float("inf")  # nothing says how the motor answers
     expected, least = _answer(record, speed, known), float(levels.min())
     if name == "velocity":
         # Differences of counts flicker, so that their mean resolves less than a step; a rounded
         # speed changes only where the motion crosses to the next level.
         changes = np.count_nonzero(np.diff(speed[known]))
-        if changes < FLICKER.value * np.abs(np.diff(expected[known])).sum() / least:
+        if changes < FLICKER * np.abs(np.diff(expected[known])).sum() / least:
             return float(np.abs(expected[a:b]).max() / least)
         least *= float(np.median(step))
     turns = np.flatnonzero(np.diff(np.sign(expected[a:b]), prepend=np.nan) != 0)

@@ -18,11 +18,14 @@ from numpy.lib.stride_tricks import sliding_window_view
 from smp_motor_control.arrays import Array, Integers
 from smp_motor_ident._compile import compiled
 from smp_motor_ident.finding import Finding
-from smp_motor_ident.quality.limits import (
+from smp_motor_ident.limits import (
+    BEAT_FLOOR,
+    BEAT_JITTER,
+    BEAT_LOST,
     BUNCHED,
     ROWS_LOST,
+    SMOOTHER,
 )
-from smp_motor_ident.quality.sample_limits import BEAT_FLOOR, BEAT_JITTER, BEAT_LOST, SMOOTHER
 from smp_motor_ident.record import Record
 
 _PAUSE = 20_000_000  # shortest silence [ns] that divides arrivals
@@ -66,9 +69,9 @@ def find_beat(arrival: Integers) -> Beat | None:
         deviations.append(fitted[2])
         late.append((arrival[begin:end] - time[begin:end]).astype(np.float64))
     latency, period = np.concatenate(late), float(np.median(periods))
-    if np.std(latency) < BEAT_JITTER.value * period or np.any(np.diff(time) <= 0):
+    if np.std(latency) < BEAT_JITTER * period or np.any(np.diff(time) <= 0):
         return None
-    repeated = float(np.mean(np.diff(arrival) < BUNCHED.value * period)) > BEAT_LOST.value
+    repeated = float(np.mean(np.diff(arrival) < BUNCHED * period)) > BEAT_LOST
     return Beat(time, period, max(deviations), float(np.median(latency)), repeated)
 
 
@@ -78,7 +81,7 @@ def _fit(arrival: Integers) -> tuple[Array, float, float] | None:
     usual = since[-1] / (since.size - 1)
     if usual <= 0:
         return None
-    apart = np.flatnonzero(np.diff(since, prepend=-np.inf, append=np.inf) > BUNCHED.value * usual)
+    apart = np.flatnonzero(np.diff(since, prepend=-np.inf, append=np.inf) > BUNCHED * usual)
     longest = int(np.diff(apart).max(initial=1))  # samples that came at once
     window = max(32, 4 * longest)
     if 4 * window > since.size:
@@ -88,13 +91,13 @@ def _fit(arrival: Integers) -> tuple[Array, float, float] | None:
     for lost in (0, 1):
         if lost:
             number += _lost(since, number, window)
-            if number[-1] - (since.size - 1) > BEAT_LOST.value * since.size:
+            if number[-1] - (since.size - 1) > BEAT_LOST * since.size:
                 return None
         begin, period = _line(number, since)
         latency = since - begin - period * number
         highest_floor = np.minimum.reduceat(latency, begins).max()
         # What arrives late catches up: where the sender is regular the floor stays.
-        if period > 0 and highest_floor <= BEAT_FLOOR.value * period * longest:
+        if period > 0 and highest_floor <= BEAT_FLOOR * period * longest:
             return begin + period * number, period, _deviation(number, since)
     return None
 
@@ -181,7 +184,7 @@ def moves_on(beat: Beat, arrival: Integers, motion: Array) -> bool:
     nearer = np.minimum(kept, put_back)
     apart = np.abs(kept - put_back) > 2.0 * np.quantile(nearer, 0.95)
     votes = np.sign(kept - put_back)[apart]
-    return bool(votes.sum() > SMOOTHER.value * np.sqrt(votes.size))
+    return bool(votes.sum() > SMOOTHER * np.sqrt(votes.size))
 
 
 def _off_line(time: Integers, value: Array) -> Array:
@@ -200,7 +203,7 @@ def on_beat(record: Record) -> Record:
     their rounding only.
     """
     steps = np.diff(record.time)
-    if np.ptp(steps) < BEAT_JITTER.value * record.sample_time:
+    if np.ptp(steps) < BEAT_JITTER * record.sample_time:
         return record
     arrival = np.rint(record.time * 1e9).astype(np.int64)
     motion = next(
@@ -242,7 +245,7 @@ def merge_bunches(record: Record) -> Record:
     within[starts[1:] - 1] = False
     if not within.any():
         return record
-    near = BUNCHED.value * float(step[within].mean())
+    near = BUNCHED * float(step[within].mean())
     usual = record.sample_time if within.all() else float(np.median(step[within]))
     if usual >= near:
         return record
@@ -291,9 +294,9 @@ def bridged(record: Record) -> Record:
     share = step / np.repeat(usual, np.diff(edges))[:-1]
     whole = np.rint(share)
     regular = np.abs(share - whole) < REGULAR
-    few = (whole > 1) & (whole <= 1 + ROWS_LOST.value)
+    few = (whole > 1) & (whole <= 1 + ROWS_LOST)
     few[np.array(record.starts[1:], dtype=np.int64) - 1] = False
-    if not few.any() or not regular.all(where=whole <= 1 + ROWS_LOST.value):
+    if not few.any() or not regular.all(where=whole <= 1 + ROWS_LOST):
         return record
     k = np.flatnonzero(few)
     voltage, m = record.voltage.copy(), whole[k]

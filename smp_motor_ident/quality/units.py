@@ -9,13 +9,14 @@ import numpy as np
 
 from smp_motor_ident.errors import SignalError
 from smp_motor_ident.finding import Finding
-from smp_motor_ident.quality.limits import (
+from smp_motor_ident.limits import (
     EXTRA_LOW_VOLTAGE,
+    FAST_MOTOR,
     HIGHEST_GAIN,
+    HIGHEST_SPEED,
     LONGEST_LAG,
     LOW_VOLTAGE,
 )
-from smp_motor_ident.quality.sample_limits import FAST_MOTOR, HIGHEST_SPEED
 from smp_motor_ident.record import Hardware, Record
 
 RATIOS = {
@@ -62,13 +63,13 @@ def implausible_voltage(records: Sequence[Record]) -> list[Finding]:
     The mean of two whole numbers over an interval is a whole or half number.
     """
     largest = max(float(np.nanmax(np.abs(r.voltage))) for r in records)
-    if largest <= EXTRA_LOW_VOLTAGE.value:
+    if largest <= EXTRA_LOW_VOLTAGE:
         return []
     whole = all(np.array_equal(2 * r.voltage, np.rint(2 * r.voltage)) for r in records)
     return [
         Finding(
             "whole_volts" if whole else "high_voltage",
-            "unreliable" if whole or largest > LOW_VOLTAGE.value else "warning",
+            "unreliable" if whole or largest > LOW_VOLTAGE else "warning",
             f"the voltage {'is whole numbers' if whole else 'goes'} up to {largest:.4g}: it may be "
             "the counts of a PWM, percent or millivolts; gain and static voltage then have this "
             "unit",
@@ -100,9 +101,9 @@ def implausible_motor(
     speed = gain * max(top - friction, 0.0)
     words = f"a speed of {speed * 30 / math.pi:.3g} rpm at {top:.3g} V"
     odd = {
-        f"a time constant of {lag:.3g} s": lag > LONGEST_LAG.value,
-        f"a gain of {gain:.3g} rad/s per volt": gain > HIGHEST_GAIN.value,
-        words: speed > HIGHEST_SPEED.value,
+        f"a time constant of {lag:.3g} s": lag > LONGEST_LAG,
+        f"a gain of {gain:.3g} rad/s per volt": gain > HIGHEST_GAIN,
+        words: speed > HIGHEST_SPEED,
     }
     numbers: dict[str, float | str | None]
     numbers = {"time_constant": lag, "dc_gain": gain, "speed": speed, "voltage": top}
@@ -113,6 +114,6 @@ def implausible_motor(
     if any(odd.values()):
         said = f"no motor has {' and '.join(word for word, there in odd.items() if there)}"
         yield Finding("implausible_motor", "warning", said, numbers, advice)
-    elif speed > FAST_MOTOR.value:
+    elif speed > FAST_MOTOR:
         said = f"the motor has {words}; among brushed motors, only those of toys do"
         yield Finding("fast_motor", "warning", said, numbers, advice)

@@ -12,16 +12,16 @@ from typing import Any
 from smp_motor_control.pid import PidGains
 from smp_motor_ident.errors import DesignError
 from smp_motor_ident.finding import Finding
-from smp_motor_ident.result import Estimate
-from smp_motor_ident.tune.case import COMMON_TARGETS, Case, prepare, solve
-from smp_motor_ident.tune.ensemble import Robustness
-from smp_motor_ident.tune.feedback import Feedback
-from smp_motor_ident.tune.limits import (
+from smp_motor_ident.limits import (
     MAX_DELAY_SHARE,
     MAX_SETTLING_LOSS,
     MIN_LIMITING_SHARE,
     SETTLING_BAND,
 )
+from smp_motor_ident.result import Estimate
+from smp_motor_ident.tune.case import COMMON_TARGETS, Case, prepare, solve
+from smp_motor_ident.tune.ensemble import Robustness
+from smp_motor_ident.tune.feedback import Feedback
 from smp_motor_ident.tune.loop import Loop
 from smp_motor_ident.tune.margins import Margins, loop_margins
 from smp_motor_ident.tune.methods import METHODS
@@ -66,7 +66,7 @@ class Design:
         return Settling(
             value=bands.settling.value,
             high=bands.settling.high,
-            tolerance=SETTLING_BAND.value,
+            tolerance=SETTLING_BAND,
             change=bands.change / self.loop.gear_ratio,
             transition=self.reference.duration(bands.change, self.loop.sample_time),
             common=self.together,
@@ -229,7 +229,7 @@ def _plan(case: Case, controller: Controller, margins: Margins) -> Reference:
         plants.append(_sample_usual(case, move_lag_to_sensor(usual.motors)))
     # Require no more tolerance of additional delay than the loop can have.
     doubt = max(loop.delay_doubt, case.scatter)
-    borne = replace(loop, delay_doubt=min(doubt, MAX_DELAY_SHARE.value * margins.delay))
+    borne = replace(loop, delay_doubt=min(doubt, MAX_DELAY_SHARE * margins.delay))
     least = 0.4 / margins.crossover if margins.crossover > 0 else 0.0
     drive = max(case.driver.drive - case.friction.planned, 0.1 * case.driver.drive)
     return plan_reference(
@@ -249,11 +249,11 @@ def _select_reference(
     stated overshoot is chosen.
     """
     tried = [(quickest, *figures(quickest))]
-    most = (1 + MAX_SETTLING_LOSS.value) * tried[0][2].settling.high  # NaN: nothing is tried
+    most = (1 + MAX_SETTLING_LOSS) * tried[0][2].settling.high  # NaN: nothing is tried
     while free and 2 * tried[-1][0].transition_time < most:
         plan = replace(quickest, transition_time=2 * tried[-1][0].transition_time)
         tried.append((plan, *figures(plan)))
-        most = min(most, (1 + MAX_SETTLING_LOSS.value) * tried[-1][2].settling.high)
+        most = min(most, (1 + MAX_SETTLING_LOSS) * tried[-1][2].settling.high)
     good = [one for one in tried if one[2].settling.high <= most] or tried[:1]
     return min(good, key=lambda one: one[2].overshoot.high)
 
@@ -287,7 +287,7 @@ def _explain(
             + known_words(unmodelled, ": ")
         )
         # Beyond the crossover |T| is as large as the gains: so much of it the rule's had.
-        if robustness.unmodelled > MIN_LIMITING_SHARE.value * min(factor, 1.0):
+        if robustness.unmodelled > MIN_LIMITING_SHARE * min(factor, 1.0):
             findings.append(Finding(
                 "unmodelled_dynamics", "warning",
                 "the gains are limited because the motor's response is known only up to "

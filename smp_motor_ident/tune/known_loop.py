@@ -15,8 +15,8 @@ import numpy as np
 from smp_motor_control.arrays import Array
 from smp_motor_ident.errors import SignalError
 from smp_motor_ident.finding import Finding
+from smp_motor_ident.limits import LOOP_RATE_TOLERANCE, MAX_COMMAND_ERROR, TICK_TOLERANCE
 from smp_motor_ident.record import Record
-from smp_motor_ident.tune.limits import LOOP_RATE_TOLERANCE, MAX_COMMAND_ERROR, TICK_TOLERANCE
 
 Step = Callable[[float, float], float]
 """From set-point, in the target's unit, and speed of the wheel [rad/s] to the command [V]."""
@@ -77,7 +77,7 @@ def reconstruct(record: Record, loop: KnownLoop, numbers: Mapping[str, float]) -
     speed, step, counted = _restore_loop_speed(speed, setting)
     volts = _run(loop.start(setting), record.voltage, speed)
     error = _error(loop, setting, record.voltage, speed, step)
-    if error > MAX_COMMAND_ERROR.value * supply:
+    if error > MAX_COMMAND_ERROR * supply:
         raise SignalError(
             f"{where}: the speed was logged in steps of {step:.3g} rad/s, so the command is known "
             f"to {error:.2g} V only; log more digits, or give counts_per_revolution if this "
@@ -98,7 +98,7 @@ def _interval(record: Record, loop: KnownLoop, numbers: Mapping[str, float]) -> 
     logged, T = record.sample_time, loop.interval(numbers)
     if math.isnan(T):
         return logged
-    if abs(logged / T - 1) > LOOP_RATE_TOLERANCE.value:
+    if abs(logged / T - 1) > LOOP_RATE_TOLERANCE:
         raise SignalError(
             f"{record.source}: {record.wheel}: logged every {1e3 * logged:.4g} ms, and the loop "
             f"ran every {1e3 * T:.4g} ms: commands between two rows are not known; log every step"
@@ -133,8 +133,8 @@ def _restore_loop_speed(speed: Array, setting: Setting) -> tuple[Array, float, d
     if math.isfinite(setting.ticks):
         exact = speed * setting.ticks * setting.sample_time
         ticks = np.rint(exact)
-        whole = np.abs(exact - ticks) < TICK_TOLERANCE.value
-        if np.mean(whole) > 1 - TICK_TOLERANCE.value:
+        whole = np.abs(exact - ticks) < TICK_TOLERANCE
+        if np.mean(whole) > 1 - TICK_TOLERANCE:
             counted = {"count": np.cumsum(ticks), "velocity": None} if whole.all() else {}
             return ticks / setting.ticks / setting.sample_time, 0.0, counted
     gaps = np.diff(np.unique(np.abs(speed)))

@@ -10,8 +10,8 @@ from smp_motor_control.arrays import Array
 from smp_motor_control.motor.parameters import COMBINATIONS, PHYSICAL
 from smp_motor_ident.errors import DesignError
 from smp_motor_ident.finding import Finding
+from smp_motor_ident.limits import MAX_FRICTION_ERROR, MAX_FRICTION_RANGE, MIN_UNRELIABLE_STD
 from smp_motor_ident.result import Estimate, Quantity
-from smp_motor_ident.tune.limits import MAX_FRICTION_ERROR, MAX_FRICTION_RANGE, MIN_UNRELIABLE_STD
 
 SENSOR = ("delay", "averaging_window", "sensor_lag")
 """Delays between the motor's speed and the reported one, in s each."""
@@ -76,14 +76,14 @@ def friction_of(estimate: Estimate, supply: float) -> Friction:
         low, high = quantity.value - half, quantity.value + half
     # The motor turned, so friction is below the supply.
     low, high = max(low, 0.0), high if quantity.total_std == 0.0 else min(high, supply)
-    if high - low > MAX_FRICTION_RANGE.value * supply:
+    if high - low > MAX_FRICTION_RANGE * supply:
         raise DesignError(
             f"{estimate.wheel}: dry friction may take anything from {low:.3g} to {high:.3g} V of "
             f"the {supply:g} V supply, so that gain and friction are known as a combination only; "
             "record the motor at two or more voltages in both directions, through standstill, and "
             "identify it again"
         )
-    if high - low <= 2 * MAX_FRICTION_ERROR.value * supply and quantity.value is not None:
+    if high - low <= 2 * MAX_FRICTION_ERROR * supply and quantity.value is not None:
         return Friction(quantity.value, low, high)
     words = (
         f"dry friction is only known to lie between {low:.3g} and {high:.3g} V: the feed-forward "
@@ -235,7 +235,7 @@ def unreliable_spread(estimate: Estimate) -> float:
     """Return the relative standard deviation assumed for an unreliable estimate."""
     fit = estimate.fit_percent.validation
     unexplained = 1.0 if fit is None else 1.0 - fit / 100
-    return min(max(MIN_UNRELIABLE_STD.value, unexplained), 0.5)
+    return min(max(MIN_UNRELIABLE_STD, unexplained), 0.5)
 
 
 def _names(estimate: Estimate) -> tuple[str, ...]:

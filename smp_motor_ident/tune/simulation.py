@@ -16,8 +16,8 @@ from smp_motor_control.arrays import Array
 from smp_motor_control.observer import DISTRUST_RATIO, INNOVATION_MEMORY_S
 from smp_motor_ident._compile import compiled
 from smp_motor_ident.chain.terminal import Driver, no_driver, put_out
+from smp_motor_ident.limits import SETTLING_BAND
 from smp_motor_ident.tune.feedback import Feedback
-from smp_motor_ident.tune.limits import SETTLING_BAND
 from smp_motor_ident.tune.plant import NO_OBSERVER, SPEED, Plant
 
 NO_EFFECT = no_driver()
@@ -269,7 +269,7 @@ def find_last_exit(time: Array, outside: NDArray[np.bool_]) -> Array:
     return np.asarray(np.append(time, math.nan)[begin], dtype=np.float64)
 
 
-def settling_time(time: Array, answer: Array, tolerance: float = SETTLING_BAND.value) -> float:
+def settling_time(time: Array, answer: Array, tolerance: float = SETTLING_BAND) -> float:
     """Return when the answer to a unit change stays within a tolerance of 1; NaN where never."""
     return float(find_last_exit(time, np.abs(answer - 1.0) > tolerance))
 

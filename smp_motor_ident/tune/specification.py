@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 
 from smp_motor_control.arrays import Array
 from smp_motor_control.wheel.plausibility import LOAD_SHARE
+from smp_motor_ident.limits import MAX_STATED_GAIN_MARGIN, MIN_OUTLIER_DEVIATIONS
 from smp_motor_ident.tune.case import Case
 from smp_motor_ident.tune.ensemble import REQUIRED_SHARE
 from smp_motor_ident.tune.feedback import Feedback
-from smp_motor_ident.tune.limits import MAX_STATED_GAIN_MARGIN, MIN_OUTLIER_DEVIATIONS
 from smp_motor_ident.tune.loop import Loop
 from smp_motor_ident.tune.margins import BatchMargins, Margins
 from smp_motor_ident.tune.plant import Plant, sample
@@ -134,7 +134,7 @@ def figures_of(
         settling=band(figures.settling, [one.settling for one in each], longer),
         phase_margin=band(margins.phase, found.phase),
         # No larger at its low end than a record can vouch for
-        gain_margin=replace(gain, low=min(gain.low, MAX_STATED_GAIN_MARGIN.value)),
+        gain_margin=replace(gain, low=min(gain.low, MAX_STATED_GAIN_MARGIN)),
         sensitivity=band(margins.sensitivity, found.sensitivity),
     )
 
@@ -218,8 +218,7 @@ def _reported_noise(case: Case, loop: Loop, shape: tuple[int, int]) -> Array | f
     top = loop.supply_voltage / float(motor.a0[0])
     load = LOAD_SHARE * loop.supply_voltage + case.swallowed
     believed = (
-        MIN_OUTLIER_DEVIATIONS.value * loop.reported_noise
-        + load / float(motor.a1[0]) * loop.sample_time
+        MIN_OUTLIER_DEVIATIONS * loop.reported_noise + load / float(motor.a1[0]) * loop.sample_time
     )
     rng = np.random.default_rng(2)
     there = rng.random(shape) < case.outliers * min(believed / top, 1.0)

@@ -35,21 +35,21 @@ from dataclasses import dataclass
 import numpy as np
 
 from smp_motor_control.arrays import Array, Complex
-from smp_motor_ident.infer.response_limits import RESONANCE_DAMPING
-from smp_motor_ident.result import Estimate
-from smp_motor_ident.tune.feedback import Feedback
-from smp_motor_ident.tune.limits import (
+from smp_motor_ident.limits import (
     MAX_RESONANCE_DAMPING,
+    RESONANCE_DAMPING,
     RESONANCE_ERROR,
     SETTLING_BAND,
     UNKNOWN_RESPONSE_ERROR,
 )
+from smp_motor_ident.result import Estimate
+from smp_motor_ident.tune.feedback import Feedback
 from smp_motor_ident.tune.plant import Plant
 from smp_motor_ident.tune.simulation import find_last_exit, settling_time
 
 FREQUENCY_COUNT = 40  # number of resonance frequencies, from the lowest of the bound up to Nyquist
 
-DAMPINGS = np.geomspace(RESONANCE_DAMPING.value, MAX_RESONANCE_DAMPING.value, 4)
+DAMPINGS = np.geomspace(RESONANCE_DAMPING, MAX_RESONANCE_DAMPING, 4)
 """Of resonances, evenly spread over those of shafts."""
 
 SHORTEST, LONGEST = 2**13, 2**16
@@ -65,7 +65,7 @@ class UnmodelledDynamics:
 
     def weight(self, omega: Array) -> Array:
         """Return the bound at some frequencies [rad/s]; nothing is known beyond the last."""
-        right = UNKNOWN_RESPONSE_ERROR.value
+        right = UNKNOWN_RESPONSE_ERROR
         bound: Array = np.interp(np.log(omega), np.log(self.frequency), self.bound, right=right)
         return bound
 
@@ -89,10 +89,8 @@ def unmodelled_dynamics(estimate: Estimate) -> UnmodelledDynamics | None:
         return None
     shown, bound = np.array(error.shown), np.array(error.bound)
     least = 2 * shown - bound
-    taken = np.minimum(
-        bound, np.where(least > 0, RESONANCE_ERROR.value, UNKNOWN_RESPONSE_ERROR.value)
-    )
-    taken = np.where(least > 1, RESONANCE_ERROR.value, taken)
+    taken = np.minimum(bound, np.where(least > 0, RESONANCE_ERROR, UNKNOWN_RESPONSE_ERROR))
+    taken = np.where(least > 1, RESONANCE_ERROR, taken)
     lowest = int(np.argmax(taken < 1))
     slower = (np.arange(taken.size) < lowest) & ~(least > 0)
     taken = np.where(slower, taken[lowest], taken)
@@ -117,7 +115,7 @@ def added_by_resonance(
     if unmodelled is None:
         return 0.0, 0.0
     T = plant.sample_time
-    ringing = -math.log(SETTLING_BAND.value) / (RESONANCE_DAMPING.value * unmodelled.known * T)
+    ringing = -math.log(SETTLING_BAND) / (RESONANCE_DAMPING * unmodelled.known * T)
     n = 2 ** math.ceil(math.log2(min(max(answer.size + ringing, SHORTEST), LONGEST)))
     usual = np.pad(answer, (0, n - answer.size), mode="edge")
     time = T * np.arange(n, dtype=np.float64)
@@ -130,7 +128,7 @@ def added_by_resonance(
             spectrum = np.pad(D * moved / (1 + D * complementary), ((0, 0), (1, 0)))
             rows = usual + np.fft.irfft(spectrum, n)
             highest = max(highest, rows.max())
-            ends.append(np.max(find_last_exit(time, np.abs(rows - 1.0) > SETTLING_BAND.value)))
+            ends.append(np.max(find_last_exit(time, np.abs(rows - 1.0) > SETTLING_BAND)))
     return float(highest - usual.max()), float(np.max(ends) - settled)
 
 

@@ -23,8 +23,7 @@ from smp_motor_control.motor.parameters import COMBINATIONS, Gearbox, MotorParam
 from smp_motor_control.parameter_file import flatten
 from smp_motor_control.wheel.loop import LoopSettings, WheelLoop
 from smp_motor_ident.finding import Finding
-from smp_motor_ident.result import Estimate
-from smp_motor_ident.tune.limits import (
+from smp_motor_ident.limits import (
     DRIVE_LEVEL,
     MAX_COMMAND_ERROR,
     MAX_PLANNED_OVERSHOOT,
@@ -32,6 +31,7 @@ from smp_motor_ident.tune.limits import (
     MAX_STEADY_ERROR,
     SETTLING_BAND,
 )
+from smp_motor_ident.result import Estimate
 from smp_motor_ident.tune.motors import draw_motors, motors_of
 from smp_motor_ident.tune.simulation import settling_time
 
@@ -127,7 +127,7 @@ def arrival_delays(
     (asked, ages, commands), (time, voltage) = answers, applied
     sent = asked + ages
     usual = np.maximum(ages, float(loop.get("usual_delay") or loop["delay"]))
-    step = MAX_COMMAND_ERROR.value * float(loop["supply_voltage"])
+    step = MAX_COMMAND_ERROR * float(loop["supply_voltage"])
     effective = np.zeros(time.size, dtype=np.intp)
     strange, unknown = 0, np.zeros(time.size, dtype=np.bool_)
     for k in range(1, time.size):
@@ -208,15 +208,14 @@ def bands_of(
     sampling and of the resolution of the speed, ``unsure`` [rad/s], are added.
     """
     margin = RESOLUTION_SIGMAS * unsure / abs(setpoint)
-    simulated = [read(time, row, setpoint, SETTLING_BAND.value + margin) for row in rows]
+    simulated = [read(time, row, setpoint, SETTLING_BAND + margin) for row in rows]
     settling = [one.settling for one in simulated] + [_high(specification, "settling")]
     overshoot = [one.overshoot for one in simulated] + [_high(specification, "overshoot")]
     step = float(np.median(np.diff(time)))
     return Reading(
         settling=max(*settling, _limit(settling[:-1])) + 2 * step,
-        overshoot=max(*overshoot, _limit(overshoot[:-1]))
-        + 100 * (MAX_PLANNED_OVERSHOOT.value + margin),
-        error=_limit([one.error for one in simulated]) + 100 * (MAX_STEADY_ERROR.value + margin),
+        overshoot=max(*overshoot, _limit(overshoot[:-1])) + 100 * (MAX_PLANNED_OVERSHOOT + margin),
+        error=_limit([one.error for one in simulated]) + 100 * (MAX_STEADY_ERROR + margin),
     )
 
 
@@ -225,7 +224,7 @@ def _limit(readings: Sequence[float]) -> float:
     n = len(readings)
     if not math.isfinite(sum(readings)):
         return math.inf
-    quantile = float(stdtrit(n - 1, 1 - DRIVE_LEVEL.value))
+    quantile = float(stdtrit(n - 1, 1 - DRIVE_LEVEL))
     return float(np.mean(readings) + quantile * np.std(readings, ddof=1) * math.sqrt(1 + 1 / n))
 
 
@@ -236,9 +235,7 @@ def change_of(
     """Return a change from a speed ``before`` it [rad/s], with its reading and its bands."""
     moved, change = speed - before, setpoint - before
     # The planned overshoot does not count as unsettled.
-    tolerance = (
-        SETTLING_BAND.value + MAX_PLANNED_OVERSHOOT.value + RESOLUTION_SIGMAS * unsure / abs(change)
-    )
+    tolerance = SETTLING_BAND + MAX_PLANNED_OVERSHOOT + RESOLUTION_SIGMAS * unsure / abs(change)
     expected = read(time, rows[0] - before, change, tolerance)
     return Change(
         wheel, name, setpoint, time, speed, rows.min(axis=0), rows[0], rows.max(axis=0),
@@ -248,7 +245,7 @@ def change_of(
         tolerance,
         expected.overshoot
         - _high(specification, "overshoot")
-        - 100 * (tolerance - SETTLING_BAND.value),
+        - 100 * (tolerance - SETTLING_BAND),
     )  # fmt: skip
 
 
@@ -294,9 +291,9 @@ def report_loop_delay(changes: Sequence[Change]) -> list[Finding]:
 
 def report_silence(silence: float) -> list[Finding]:
     """Return the finding where a wheel was without control for a while [s]."""
-    if silence <= MAX_SILENCE.value:
+    if silence <= MAX_SILENCE:
         return []
-    evidence = {"silence": silence, "limit": MAX_SILENCE.value}
+    evidence = {"silence": silence, "limit": MAX_SILENCE}
     text = f"a wheel received no command for {silence:.2f} s, so the drive does not test the gains"
     return [Finding("verification_disturbed", "refused", text, evidence, _TIME)]
 

@@ -16,9 +16,9 @@ from smp_motor_control.wheel.differenced import differenced_gains
 from smp_motor_control.wheel.faults import FaultLimits
 from smp_motor_control.wheel.loop import LoopSettings
 from smp_motor_control.wheel.stop import MAX_STOP_TIME_S
+from smp_motor_ident.limits import MIN_OUTLIER_DEVIATIONS
 from smp_motor_ident.result import plain
 from smp_motor_ident.tune.designer import Design
-from smp_motor_ident.tune.limits import MIN_OUTLIER_DEVIATIONS
 from smp_motor_ident.tune.loop import Loop
 
 SCHEMA = 1
@@ -115,9 +115,7 @@ def _plausible(top_speed: float, loop: Loop) -> dict[str, float]:
     if 2 * top_speed > usual:
         limits["implausible_velocity"] = 2 * top_speed
     if loop.reported_noise:
-        limits["implausible_jump"] = (
-            MIN_OUTLIER_DEVIATIONS.value * loop.reported_noise / loop.gear_ratio
-        )
+        limits["implausible_jump"] = MIN_OUTLIER_DEVIATIONS * loop.reported_noise / loop.gear_ratio
     return limits
 
 

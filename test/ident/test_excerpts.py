@@ -6,8 +6,8 @@ import numpy as np
 
 from smp_motor_ident.cli.identification import identify_wheel
 from smp_motor_ident.estimate import estimate
+from smp_motor_ident.limits import EXCERPT
 from smp_motor_ident.quality.excitation import STRETCHES, excerpts
-from smp_motor_ident.quality.sample_limits import EXCERPT
 from smp_motor_ident.record import Record
 
 SIGMAS = 4.0  # one of four quantities passes them by chance in 4,000 records; the seed is fixed
@@ -44,7 +44,7 @@ def test_the_stretches_of_a_long_record_tell_its_motor() -> None:
 
 
 def test_identify_uses_and_shows_stretches_of_a_long_record() -> None:
-    rows = round(1.2 * EXCERPT.value)
+    rows = round(1.2 * EXCERPT)
     rng = np.random.default_rng(0)
     time = 0.001 * np.arange(rows)
     voltage = np.repeat(rng.uniform(-6.0, 6.0, rows // 100), 100)

@@ -10,19 +10,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from smp_motor_ident.bag.limits import MAX_COLUMNS
 from smp_motor_ident.bag.storage import TABLE, Batch, Channel, Table, damaged
 from smp_motor_ident.bag.unpack import Budget
 from smp_motor_ident.errors import BagError
 from smp_motor_ident.finding import Finding
+from smp_motor_ident.limits import MAX_COLUMNS
 
 
 def check_width(count: int, name: str, what: str = "columns") -> None:
     """Raise `BagError` for more columns or topics than a robot's log can have."""
-    if count > MAX_COLUMNS.value:
-        raise BagError(
-            f"{name}: has more than {MAX_COLUMNS.value:.0f} {what}; keep those of the motors"
-        )
+    if count > MAX_COLUMNS:
+        raise BagError(f"{name}: has more than {MAX_COLUMNS:.0f} {what}; keep those of the motors")
 
 
 class Source(ABC):

@@ -12,12 +12,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from smp_motor_ident.bag.limits import MAX_STRAY_ROW_SHARE
 from smp_motor_ident.bag.readers.format import check_width
 from smp_motor_ident.bag.storage import found
 from smp_motor_ident.bag.units import written_unit
 from smp_motor_ident.errors import BagError
 from smp_motor_ident.finding import Finding
+from smp_motor_ident.limits import MAX_STRAY_ROW_SHARE
 
 Row = Sequence[Any]
 _MISSING = ("", "nan", "na", "n/a", "null", "none", "-", "inf", "-inf", "#n/a")
@@ -99,7 +99,7 @@ def numeric(names: Sequence[str], rows: Sequence[Row]) -> tuple[str, ...]:
 def words(cells: Sequence[str]) -> tuple[str, ...]:
     """Return the words of a column without outliers; none for numbers, states or one word."""
     counts = Counter(filter(None, cells))
-    usual = tuple(c for c, n in counts.items() if n > MAX_STRAY_ROW_SHARE.value * len(cells))
+    usual = tuple(c for c, n in counts.items() if n > MAX_STRAY_ROW_SHARE * len(cells))
     if (
         len(usual) < 2
         or any(map(_is_readable_cell, usual))
@@ -208,7 +208,7 @@ def columns(
                 break
     # Notes below the table do not belong to it.
     inside = [k for k in stray if k < last or 2 * len(rows[k]) > len(rows[last])]
-    if len(inside) > MAX_STRAY_ROW_SHARE.value * (len(sound_rows) + len(inside)):
+    if len(inside) > MAX_STRAY_ROW_SHARE * (len(sound_rows) + len(inside)):
         k = inside[0]
         raise BagError(f"{where}: line {lines[k]}, {_describe_bad_cell(rows[k], use, names)}")
     findings = []

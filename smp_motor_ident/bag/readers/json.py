@@ -20,7 +20,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from smp_motor_ident.bag.limits import MAX_COLUMNS, MAX_STRAY_ROW_SHARE
 from smp_motor_ident.bag.readers import grid
 from smp_motor_ident.bag.readers.format import ColumnFile, Format
 from smp_motor_ident.bag.storage import damaged, found
@@ -28,6 +27,7 @@ from smp_motor_ident.bag.units import UNITS, needs, written_unit
 from smp_motor_ident.bag.unpack import Budget
 from smp_motor_ident.errors import BagError
 from smp_motor_ident.finding import Finding
+from smp_motor_ident.limits import MAX_COLUMNS, MAX_STRAY_ROW_SHARE
 
 _TESTS = ("slow-forward", "slow-backward", "fast-forward", "fast-backward")
 _ONE_MOTOR = ("Simple", "Arm", "Elevator")
@@ -63,7 +63,7 @@ def _open(path: Path, name: str, budget: Budget) -> ColumnFile:
         columns, units, radius, problems = _sysid(document, name)
     else:
         try:
-            columns = dict(islice(_columns("", document, 0, dates), round(MAX_COLUMNS.value) + 1))
+            columns = dict(islice(_columns("", document, 0, dates), round(MAX_COLUMNS) + 1))
         except RecursionError:
             raise BagError(f"{name}: is nested too deeply") from None
     problems += [damaged(problem)] if problem else []
@@ -97,9 +97,9 @@ def _lines(text: str, name: str) -> tuple[list[Any], str]:
             rows.append(json.loads(line))
         except ValueError:
             bad += 1
-            if bad > 1 + MAX_STRAY_ROW_SHARE.value * len(lines):
+            if bad > 1 + MAX_STRAY_ROW_SHARE * len(lines):
                 break
-    if not rows or bad > max(1, MAX_STRAY_ROW_SHARE.value * len(rows)):
+    if not rows or bad > max(1, MAX_STRAY_ROW_SHARE * len(rows)):
         raise ValueError(f"{bad} of {bad + len(rows)} lines are not JSON")
     return rows, f"{name}: {bad} lines that are not JSON were left out" if bad else ""
 

@@ -6,10 +6,10 @@ from collections.abc import Mapping
 from typing import Any
 
 from smp_motor_control.errors import printable
+from smp_motor_ident.limits import SETTLING_BAND
 from smp_motor_ident.result import Estimate
 from smp_motor_ident.tune.exports.formats import FORMATS
 from smp_motor_ident.tune.exports.target import Check, Format, Gains, check
-from smp_motor_ident.tune.limits import SETTLING_BAND
 from smp_motor_ident.tune.loop import Loop
 from smp_motor_ident.tune.wheels import Sets, design_wheels
 
@@ -40,7 +40,7 @@ def export(
 
 
 def _settles(one: Check) -> str:
-    if one.resting_error > SETTLING_BAND.value:
+    if one.resting_error > SETTLING_BAND:
         return f"rests within {100 * one.resting_error:.1f} % of it, as whole numbers allow"
     if math.isnan(one.step.settling):
         return "does not settle within 2 %"

@@ -9,6 +9,7 @@ import numpy as np
 from smp_motor_control.parameter_file import format_parameters
 from smp_motor_control.pid import Pid, PidGains
 from smp_motor_ident.errors import DesignError, SignalError
+from smp_motor_ident.limits import SETTLING_BAND
 from smp_motor_ident.tune.designer import Design
 from smp_motor_ident.tune.exports.target import (
     Format,
@@ -23,7 +24,6 @@ from smp_motor_ident.tune.exports.target import (
 )
 from smp_motor_ident.tune.feedback import Feedback
 from smp_motor_ident.tune.known_loop import KnownLoop, Setting, Step
-from smp_motor_ident.tune.limits import SETTLING_BAND
 from smp_motor_ident.tune.margins import batch_margins, grid_for
 
 MAX_PWM = 255  # of eight bits, as Arduino's `analogWrite` takes it
@@ -366,7 +366,7 @@ def _convert_roboclaw(design: Design) -> Gains:
         return Gains(numbers, feedback, velocity=forward, tracking=max(p / max(i, 1), T))
 
     tried = map(gains, GAIN_SHARES)
-    most = 100 * SETTLING_BAND.value
+    most = 100 * SETTLING_BAND
     return next((one for one in tried if check(design, one).step.overshoot <= most), gains(0.0))
 
 

@@ -8,10 +8,10 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from smp_motor_ident.errors import DesignError
+from smp_motor_ident.limits import SETTLING_BAND
 from smp_motor_ident.tune.designer import Design
 from smp_motor_ident.tune.feedback import Feedback
 from smp_motor_ident.tune.known_loop import KnownLoop
-from smp_motor_ident.tune.limits import SETTLING_BAND
 from smp_motor_ident.tune.loop import Loop
 from smp_motor_ident.tune.margins import Margins, loop_margins
 from smp_motor_ident.tune.motors import Motors
@@ -94,7 +94,7 @@ def check(design: Design, gains: Gains) -> Check:
     friction = np.array([design.motor["static_voltage"]])
     run = simulate(plant, controller, inputs, friction=friction)
     step = step_figures(time, run.speed[0], run.voltage[0], target)
-    if gains.resting_error > SETTLING_BAND.value * target:
+    if gains.resting_error > SETTLING_BAND * target:
         step = replace(step, settling=math.nan)
     return Check(loop_margins(plant, gains.feedback), step, gains.resting_error / target)
 
@@ -114,7 +114,7 @@ def duration(design: Design, gains: Gains) -> float:
         needed = a0 + (design.motor["static_voltage"] - gains.static) / target
         given = gains.velocity + fb.p * (gains.weight - 1)
         left = abs(given - needed) / (fb.p + a0) + rise / slow
-        tail = slow * max(math.log(10 * left / SETTLING_BAND.value), 0.0)
+        tail = slow * max(math.log(10 * left / SETTLING_BAND), 0.0)
     return float(0.5 + 12 * rise + tail)
 
 

@@ -18,8 +18,8 @@ import numpy as np
 
 from smp_motor_control.arrays import Array
 from smp_motor_ident.errors import DesignError
+from smp_motor_ident.limits import MAX_SPEED_NOISE
 from smp_motor_ident.tune.feedback import Feedback, spectral_radius, terms
-from smp_motor_ident.tune.limits import MAX_SPEED_NOISE
 from smp_motor_ident.tune.margins import loop_margins
 from smp_motor_ident.tune.methods.rules import SIMC
 from smp_motor_ident.tune.problem import Method, Problem, RequiredMargins
@@ -228,7 +228,7 @@ def _hold(problem: Problem, c: _Candidates, margin: float, peak: float, hump: fl
     good &= problem.noise_rms(control * back) <= problem.loop.noise_limit
     shaking = problem.noise_rms(control * back * problem.true_response)
     top = problem.loop.supply_voltage / float(problem.plant.motors.a0[0])
-    return np.asarray(good & (shaking <= problem.shaking * MAX_SPEED_NOISE.value * top))
+    return np.asarray(good & (shaking <= problem.shaking * MAX_SPEED_NOISE * top))
 
 
 def _at_bandwidth(problem: Problem, wished: float, margin: float, peak: float) -> Feedback:
