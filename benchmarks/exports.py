@@ -22,7 +22,7 @@ from tuning import combinations, estimate_of, random_motors
 
 from smp_motor_ident.errors import DesignError
 from smp_motor_ident.tune import Loop, design
-from smp_motor_ident.tune.exports import FORMATS, check
+from smp_motor_ident.tune.exports import FORMATS, TARGETS, check
 from smp_motor_ident.tune.exports.target import duration
 
 Law = Callable[[float, float, int], float]
@@ -87,20 +87,6 @@ def arduino_pid(n: Mapping[str, float], T: float) -> Law:
     return law
 
 
-def roboclaw(n: Mapping[str, float], T: float) -> Law:
-    """Feed the set-point forward by QPPS, with the duty as a share of it, by the documentation."""
-    total = 0.0
-
-    def law(r: float, y: float, counts: int) -> float:
-        nonlocal total
-        wanted, limit = r * COUNTS / (2 * math.pi), n["QPPS"]
-        e = wanted - counts / T
-        total = min(max(total + n["I"] / 65536 * T * e, -limit), limit)
-        return min(max((wanted + n["P"] / 65536 * e + total) / limit, -1), 1) * SUPPLY
-
-    return law
-
-
 def wpilib(n: Mapping[str, float], T: float) -> Law:
     """Feed-forward of a constant speed, and kP."""
 
@@ -113,7 +99,7 @@ def wpilib(n: Mapping[str, float], T: float) -> Law:
 
 LAWS = {
     law.__name__: law
-    for law in (ros2_controllers, linorobot2, ros_arduino_bridge, arduino_pid, roboclaw, wpilib)
+    for law in (ros2_controllers, linorobot2, ros_arduino_bridge, arduino_pid, wpilib)
 }
 
 
@@ -143,7 +129,7 @@ def attempt(name: str, motor) -> tuple[float, ...] | None:
     loop = Loop(sample_time=T, gear_ratio=RATIO, counts_per_revolution=COUNTS,
                 supply_voltage=SUPPLY, speed_source="difference")  # fmt: skip
     try:
-        one = design(estimate_of(motor), loop, samples=100, **target.targets)
+        one = design(estimate_of(motor), loop, samples=100, **TARGETS)
         gains = target.convert(one)
     except DesignError:
         return None

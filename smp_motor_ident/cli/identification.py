@@ -329,8 +329,6 @@ def reconstruction(arguments: argparse.Namespace) -> Reconstruct:
     if name not in FORMATS:
         raise ParameterError(f"--controller {name}; it must be one of {', '.join(FORMATS)}")
     loop = FORMATS[name].known
-    if loop is None:
-        raise ParameterError(f"--controller {name}: its arithmetic is not published; log the duty")
     numbers = {**loop.defaults, **_numbers(items, f"--controller {name}", loop.defaults)}
     missing = [key for key, value in numbers.items() if math.isnan(value)]
     if missing:

@@ -12,7 +12,7 @@ METHODS = (
     "margin", "pole_placement", "simc", "ziegler_nichols", "tyreus_luyben", "relay",
 )  # fmt: skip
 FORMATS = (
-    "ros2_controllers", "linorobot2", "ros_arduino_bridge", "arduino_pid", "roboclaw", "wpilib",
+    "ros2_controllers", "linorobot2", "ros_arduino_bridge", "arduino_pid", "wpilib",
 )  # fmt: skip
 SPEED_SOURCES = ("measured", "difference", "observer")
 

@@ -144,7 +144,6 @@ def test_a_lost_sample_ends_the_known_part_of_the_loop():
 @pytest.mark.parametrize(
     ("arguments", "complaint"),
     [
-        (["roboclaw"], "not published"),
         (["linorobot2", "K_P=1"], "give K_I=..."),
         (["linorobot2", "K_P=1", "K_I=1", "K_X=1"], "takes K_P, K_I"),
         (["arduino", "Kp=1"], "must be one of"),

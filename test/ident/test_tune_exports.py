@@ -15,7 +15,7 @@ from results import estimate
 from smp_motor_ident.cli.tune import main
 from smp_motor_ident.report.document import identification_document
 from smp_motor_ident.tune import Loop, design
-from smp_motor_ident.tune.exports import FORMATS, check
+from smp_motor_ident.tune.exports import FORMATS, TARGETS, check
 
 ROOT = Path(__file__).resolve().parents[2]
 MOTORS = ROOT / "config" / "motors_paper.yaml"
@@ -47,7 +47,6 @@ def test_export_writes_parameters_and_limitations(name, tmp_path, capsys):
         "linorobot2": ("#define K_P", "#define K_I"),
         "ros_arduino_bridge": ("int Kp = ", "// Ko: ", "#define PID_RATE 30  // 33 ms"),
         "arduino_pid": ("SetOutputLimits(-255, 255)", "rear_left_pid"),
-        "roboclaw": ("QPPS", "front_left: P"),
         "wpilib": ("kS = ", "kV = ", "kA = ", "kP = "),
         "ros2_controllers": ("pid_controller/PidController",),
     }[name]:
@@ -66,7 +65,7 @@ def test_whole_numbers_that_let_an_error_rest_are_named():
         sample_time=1 / 30, counts_per_revolution=11.0, speed_source="difference", gear_ratio=30.0
     )
     loop = replace(loop, noise_voltage=3.0)
-    one = design(BENCH.estimate_of(BENCH.TABLE_1["rear_left"]), loop, samples=60, **target.targets)
+    one = design(BENCH.estimate_of(BENCH.TABLE_1["rear_left"]), loop, samples=60, **TARGETS)
     gains = target.convert(one)
     numbers = gains.numbers
     # An error of one tick less than Ko/Kp is divided to nothing.
@@ -87,7 +86,7 @@ def test_intervals_that_a_target_cannot_have_are_refused_with_the_nearest(tmp_pa
 def test_a_wheel_blocked_at_full_speed_does_not_overflow_16_bits():
     target = FORMATS["ros_arduino_bridge"]
     loop = Loop(sample_time=0.033, counts_per_revolution=4000.0, speed_source="difference")
-    one = design(BENCH.estimate_of(BENCH.TABLE_1["front_left"]), loop, samples=60, **target.targets)
+    one = design(BENCH.estimate_of(BENCH.TABLE_1["front_left"]), loop, samples=60, **TARGETS)
     numbers = target.convert(one).numbers
     fastest = BENCH.SUPPLY / BENCH.combinations(BENCH.TABLE_1["front_left"])[0]
     assert 0 < numbers["Kd"] * fastest * 4000 / (2 * math.pi) * 0.033 <= 32767

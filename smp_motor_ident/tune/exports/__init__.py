@@ -9,7 +9,7 @@ from smp_motor_control.errors import printable
 from smp_motor_ident.limits import SETTLING_BAND
 from smp_motor_ident.result import Estimate
 from smp_motor_ident.tune.exports.formats import FORMATS
-from smp_motor_ident.tune.exports.target import Check, Format, Gains, check
+from smp_motor_ident.tune.exports.target import TARGETS, Check, Format, Gains, check
 from smp_motor_ident.tune.loop import Loop
 from smp_motor_ident.tune.wheels import Sets, design_wheels
 
@@ -20,7 +20,7 @@ def export(
     """Design for a target's loop and return its parameters as text, with their effect."""
     target = FORMATS[name]
     sets: Sets = "one" if target.one_set else "each"
-    asked = {**target.targets, **targets}
+    asked = {**TARGETS, **targets}
     wheels = design_wheels(estimates, loops, "margin", sets, together=False, **asked)
     gains = {wheel: target.convert(one) for wheel, one in wheels.designs.items()}
     checks = {wheel: check(one, gains[wheel]) for wheel, one in wheels.designs.items()}
@@ -47,4 +47,4 @@ def _settles(one: Check) -> str:
     return f"settles in {one.step.settling:.3g} s"
 
 
-__all__ = ["FORMATS", "Check", "Format", "Gains", "check", "export"]
+__all__ = ["FORMATS", "TARGETS", "Check", "Format", "Gains", "check", "export"]

@@ -3,7 +3,7 @@
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -18,6 +18,8 @@ from smp_motor_ident.tune.motors import Motors
 from smp_motor_ident.tune.plant import Plant, sample
 from smp_motor_ident.tune.reference import STEP_SHARE
 from smp_motor_ident.tune.simulation import Controller, Inputs, StepFigures, simulate, step_figures
+
+TARGETS = {"structure": "pi", "focus": "tracking"}  # of the designs that are exported
 
 
 @dataclass(frozen=True)
@@ -48,13 +50,9 @@ class Format:
     # From the numbers of all wheels to the text that the target takes
     render: Callable[[Mapping[str, Design], Mapping[str, Gains]], str]
     missing: tuple[str, ...]  # parts of a design that it cannot express
+    known: KnownLoop  # its arithmetic
     counts: bool = True  # whether it makes its speed from counts, over one of its intervals
     one_set: bool = False  # whether all wheels share their numbers
-    # Targets of the method
-    targets: Mapping[str, str] = field(
-        default_factory=lambda: {"structure": "pi", "focus": "tracking"}
-    )
-    known: KnownLoop | None = None  # its arithmetic; None where that is not published
 
 
 @dataclass(frozen=True)
