@@ -163,18 +163,7 @@ class Record:
         return float(np.median(np.diff(self.time)))
 
     def slice(self, begin: int, end: int) -> Record:
-        """Return the samples ``begin`` to ``end`` (exclusive) as a record of their own.
-
-        Parameters
-        ----------
-        begin, end : int
-            Sample indices with ``0 <= begin < end - 1``.
-
-        Returns
-        -------
-        Record
-            Time starts again at 0; segments that begin inside are kept.
-        """
+        """Return the samples ``begin`` to ``end`` (exclusive) as a record that starts at time 0."""
         arrays: dict[str, Any] = {
             name: None if (values := getattr(self, name)) is None else values[begin:end]
             for name in ("voltage", "current", "velocity", "position", "count")

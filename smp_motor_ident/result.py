@@ -23,40 +23,42 @@ Status = Literal["estimated", "fixed", "unidentifiable"]
 
 NORMAL_95 = 1.959964  # half the 95 % interval of a normal distribution, in standard deviations
 
-UNITS: Mapping[str, str] = {
-    "resistance": "ohm",
-    "inductance": "H",
-    "motor_constant": "N m/A",
-    "inertia": "kg m^2",
-    "viscous_friction": "N m s/rad",
-    "coulomb_friction": "N m",
-    "coulomb_friction_reverse": "N m",
-    "delay": "s",
-    "dc_gain": "rad/s/V",
-    "time_constant": "s",
-    "time_constant_product": "s^2",
-    "static_voltage": "V",
-    "static_voltage_reverse": "V",
-    "load_voltage": "V",
-    "steady_speed": "rad/s",
-    "averaging_window": "s",
-    "sensor_lag": "s",
-    "current_lag": "s",
-    "encoder_error": "rad",
-    "dead_zone": "V",
-    "least_command": "V",
-    "clip_voltage": "V",
-    "slew_rate": "V/s",
-    "source_resistance_ratio": "1",
-    "brush_drop": "V",
-    "current_limit_voltage": "V",
-    "quadratic_drag": "1/V",
-    "fast_decay_ratio": "1",
-    "coasting_share": "1",
-    "resonance_frequency": "rad/s",
-    "resonance_damping": "1",
-}
-"""Unit of every quantity that a model may report, at the motor shaft."""
+QUANTITIES: Mapping[str, tuple[str, str, str, str]] = {
+    "resistance": ("ohm", "R", "Resistance", "of the armature winding"),
+    "inductance": ("H", "L", "Inductance", "of the armature winding"),
+    "motor_constant": ("N m/A", "K", "Motor constant", "torque per ampere, and back-EMF per rad/s"),
+    "inertia": ("kg m^2", "J", "Inertia", "of rotor and load, at the motor shaft"),
+    "viscous_friction": ("N m s/rad", "b", "Viscous friction", "torque per rad/s"),
+    "coulomb_friction": ("N m", "Tc", "Coulomb friction", "constant torque against the motion"),
+    "coulomb_friction_reverse": ("N m", "Tc−", "Coulomb friction, reverse", "turning backwards"),
+    "delay": ("s", "τd", "Delay", "from voltage to speed, sensor filters included"),
+    "dc_gain": ("rad/s/V", "k", "DC gain", "steady motor speed per volt beyond the static voltage"),
+    "time_constant": ("s", "τ", "Time constant", "sum of the lags from voltage to speed"),
+    "time_constant_product": ("s^2", "τ₁τ₂", "Lag product", "of the two time constants"),
+    "static_voltage": ("V", "v0", "Static voltage", "voltage that overcomes Coulomb friction"),
+    "static_voltage_reverse": ("V", "v0−", "Static voltage, reverse", "turning backwards"),
+    "load_voltage": ("V", "vl", "Load voltage", "voltage that a constant load takes"),
+    "steady_speed": ("rad/s", "ω∞", "Steady speed", "at the one voltage that was recorded"),
+    "averaging_window": ("s", "w", "Averaging window", "over which the sensor averages the speed"),
+    "sensor_lag": ("s", "τs", "Sensor lag", "of the speed's low-pass"),
+    "current_lag": ("s", "τi", "Current lag", "mean lag of the current sensor"),
+    "encoder_error": ("rad", "e", "Encoder error", "amplitude of its error once a turn"),
+    "dead_zone": ("V", "vd", "Dead zone", "voltage that the driver subtracts from every command"),
+    "least_command": ("V", "vm", "Least command", "size below which the driver ignores a command"),
+    "clip_voltage": ("V", "vc", "Clip voltage", "largest voltage of the driver"),
+    "slew_rate": ("V/s", "dv/dt", "Slew rate", "largest rate of the driver's voltage"),
+    "source_resistance_ratio":
+        ("1", "ρ", "Source resistance", "of the supply, over the armature's"),
+    "brush_drop": ("V", "vb", "Brush drop", "over brushes or transistors, whatever the current"),
+    "current_limit_voltage": ("V", "vi", "Current limit", "of the driver, times the resistance"),
+    "quadratic_drag":
+        ("1/V", "c", "Quadratic drag", "voltage of the drag over the square of the back-EMF"),
+    "fast_decay_ratio": ("1", "τₑf", "Fast-decay ratio", "electrical time constant in PWM periods"),
+    "coasting_share":
+        ("1", "s₀", "Coasting share", "share of back-EMF in the voltage at steady speed"),
+}  # fmt: skip
+"""Unit, symbol, name and meaning of every quantity that a model may report, at the motor shaft."""
+UNITS = {name: unit for name, (unit, *_) in QUANTITIES.items()}
 
 
 @dataclass(frozen=True)
@@ -286,49 +288,17 @@ class Estimate:
         return not self.unidentifiable
 
     def value(self, name: str, default: float = 0.0) -> float:
-        """Return the value of a parameter or combination.
-
-        Parameters
-        ----------
-        name : str
-            Such as ``dc_gain``.
-        default : float
-            Returned where the estimate does not hold it.
-
-        Returns
-        -------
-        float
-            In the unit of ``UNITS[name]``.
-        """
+        """Return a parameter or combination in its unit, ``default`` where it has no value."""
         quantity = self.combinations.get(name) or self.parameters.get(name)
         return default if quantity is None or quantity.value is None else quantity.value
 
     def evidence(self, code: str, name: str) -> float:
-        """Return the largest number of that name in the findings of a code, 0 without one.
-
-        Parameters
-        ----------
-        code : str
-            Of the findings, such as ``torque_noise``.
-        name : str
-            Of their evidence.
-
-        Returns
-        -------
-        float
-            In the unit of the evidence.
-        """
+        """Return the largest evidence ``name`` in the findings of a code, 0 without one."""
         found = (f.evidence.get(name) for f in self.findings if f.code == code)
         return max((float(x) for x in found if isinstance(x, int | float)), default=0.0)
 
     def to_document(self) -> dict[str, Any]:
-        """Return the motor's entry of ``identification.json``.
-
-        Returns
-        -------
-        dict
-            Of plain types; numbers that do not exist are None.
-        """
+        """Return the motor's entry of ``identification.json``, of plain types."""
         document: dict[str, Any] = {name: getattr(self, name) for name in _WRITTEN}
         document["covariance"] = {"names": self.names, "matrix": self.covariance}
         document["residuals"] = {

@@ -11,13 +11,7 @@ from smp_motor_control.fields import parameters_in
 
 
 def plain(text: str) -> str:
-    """Return a docstring without markup, such as ``motor_state`` or :class:`~wheel.Lease`.
-
-    Examples
-    --------
-    >>> plain("One step of :class:`~smp_motor_control.pid.Pid` for each ``motor_state``.")
-    'One step of Pid for each motor_state.'
-    """
+    """Return a docstring without markup, such as ``motor_state`` or :class:`~wheel.Lease`."""
     return re.sub(r":\w+:`~?(?:[\w.]+\.)?(\w+)`", r"\1", text).replace("``", "")
 
 

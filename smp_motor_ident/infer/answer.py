@@ -59,23 +59,8 @@ def answer(
 ) -> Answer:  # fmt: skip
     """Return the quantities that a fit tells, and those that the data leave open.
 
-    Parameters
-    ----------
-    data, found : Data, Fit
-        The recording, and the chain that was fitted to it.
-    parts : sequence of Contribution
-        Of the uncertainty of the chain's parameters.
-    levels : Levels
-        Sizes of the voltage.
-    hardware : Hardware
-        Accuracies of the instruments.
-    known : mapping of str to float
-        Values fixed by the user.
-
-    Returns
-    -------
-    Answer
-        By the names of `result.UNITS`.
+    ``parts`` are the contributions to the uncertainty of the chain's parameters, ``known`` the
+    values that the user fixed, by the names of `result.UNITS`.
     """
     separated = any(c.quantity in HIDDEN for c in found.chain.constraints)
     every, rows = jacobian(

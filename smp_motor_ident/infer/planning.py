@@ -52,29 +52,12 @@ def what_next(
     longest: float = 600.0,
     current_noise: float = 0.01,
 ) -> Proposal:
-    """Propose the excitation that would bring every parameter to a wanted accuracy.
+    """Propose the shortest excitation that brings every parameter to a relative accuracy.
 
-    Several amplitudes and bands are simulated with the estimated motor; the information of each
-    grows in proportion to its length.  Where the current was not measured, the prediction holds for
-    the least favourable motor of the same response.
-
-    Parameters
-    ----------
-    estimate : Estimate
-        Of the motor.
-    accuracy : float
-        Wanted, relative.
-    supply : float, optional
-        Largest voltage [V]; default: the supply's, or that of the recording.
-    longest : float
-        Longest recording [s].
-    current_noise : float
-        Standard deviation of the current [A].
-
-    Returns
-    -------
-    Proposal
-        The shortest excitation that suffices, or the one that comes nearest.
+    Several amplitudes up to ``supply`` [V] (default: the robot's, or that of the recording) and
+    bands are simulated with the estimated motor; the information of each grows in proportion to its
+    length, of at most ``longest`` [s].  Where the current was not measured, the prediction holds
+    for the least favourable motor of the same response, and a current with ``current_noise`` [A].
     """
     limit = supply or estimate.hardware.supply_voltage or estimate.largest_voltage
     if not limit:

@@ -58,25 +58,11 @@ FIRST = 2  # lines from 0 that the window fills with the mean
 def estimate_model_error(
     segment: Integers, error: Array, outputs: Sequence[Array], is_angle: bool, step: float
 ) -> ModelError | None:
-    """Return the relative error of the model's response over frequency, None where none is seen.
+    """Return the relative error of the model's response by bands of frequency, None without one.
 
-    Parameters
-    ----------
-    segment : ndarray of int, shape (segments + 1,)
-        First row of every segment.
-    error : ndarray, shape (n,)
-        Measured less simulated output; NaN without a measurement, interpolated linearly.
-    outputs : sequence of ndarray, shape (n,)
-        Response to the voltage, with friction and without.
-    is_angle : bool
-        Whether these are angles.
-    step : float
-        Interval between rows [s].
-
-    Returns
-    -------
-    ModelError or None
-        By bands of frequency.
+    ``segment`` are the first rows of the segments, and the end.  ``error``, shape (n,), is measured
+    less simulated output, NaN without a measurement; ``outputs``, of shape (n,) each, are the
+    responses to the voltage with friction and without, ``step`` [s] is the interval of rows.
     """
     lines = [
         _spectra(error[a:b], [one[a:b] for one in outputs], is_angle, step)

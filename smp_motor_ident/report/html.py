@@ -11,7 +11,7 @@ from smp_motor_ident.report import figures, summary, templates, words
 from smp_motor_ident.report.comparison import compare
 from smp_motor_ident.report.drawing import Chart
 from smp_motor_ident.report.figures import Comparison
-from smp_motor_ident.result import Estimate, Quantity
+from smp_motor_ident.result import QUANTITIES, Estimate, Quantity
 
 if TYPE_CHECKING:
     from smp_motor_ident.report.tuning_page import Tuning
@@ -105,7 +105,7 @@ def _gains(estimate: Estimate, report: Report) -> tuple[str, str]:
 
 def _row(name: str, quantity: Quantity, doubt: int | None) -> dict[str, Any]:
     """Return one line of a table of quantities, in words; ``doubt`` is the message against it."""
-    symbol, title, meaning = words.EXPLAINED.get(name, ("", words.label(name), ""))
+    _, symbol, title, meaning = QUANTITIES.get(name, ("", "", words.label(name), ""))
     return dict(
         symbol=symbol,
         name=title,

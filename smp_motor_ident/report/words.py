@@ -7,44 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from datetime import datetime, timezone
 
-from smp_motor_ident.result import Quantity
-
-EXPLAINED: Mapping[str, tuple[str, str, str]] = {
-    "resistance": ("R", "Resistance", "of the armature winding"),
-    "inductance": ("L", "Inductance", "of the armature winding"),
-    "motor_constant": ("K", "Motor constant", "torque per ampere, and back-EMF per rad/s"),
-    "inertia": ("J", "Inertia", "of rotor and load, at the motor shaft"),
-    "viscous_friction": ("b", "Viscous friction", "torque per rad/s"),
-    "coulomb_friction": ("Tc", "Coulomb friction", "constant torque against the motion"),
-    "coulomb_friction_reverse": ("Tc−", "Coulomb friction, reverse", "turning backwards"),
-    "delay": ("τd", "Delay", "from voltage to speed, sensor filters included"),
-    "dc_gain": ("k", "DC gain", "steady motor speed per volt beyond the static voltage"),
-    "time_constant": ("τ", "Time constant", "sum of the lags from voltage to speed"),
-    "time_constant_product": ("τ₁τ₂", "Lag product", "of the two time constants"),
-    "static_voltage": ("v0", "Static voltage", "voltage that overcomes Coulomb friction"),
-    "static_voltage_reverse": ("v0−", "Static voltage, reverse", "turning backwards"),
-    "steady_speed": ("ω∞", "Steady speed", "at the one voltage that was recorded"),
-    "load_voltage": ("vl", "Load voltage", "voltage that a constant load takes"),
-    "averaging_window": ("w", "Averaging window", "over which the sensor averages the speed"),
-    "sensor_lag": ("τs", "Sensor lag", "of the speed's low-pass"),
-    "dead_zone": ("vd", "Dead zone", "voltage that the driver subtracts from every command"),
-    "least_command": ("vm", "Least command", "size below which the driver ignores a command"),
-    "clip_voltage": ("vc", "Clip voltage", "largest voltage of the driver"),
-    "slew_rate": ("dv/dt", "Slew rate", "largest rate of the driver's voltage"),
-    "source_resistance_ratio": ("ρ", "Source resistance", "of the supply, over the armature's"),
-    "brush_drop": ("vb", "Brush drop", "over brushes or transistors, whatever the current"),
-    "quadratic_drag": (
-        "c",
-        "Quadratic drag",
-        "voltage of the drag over the square of the back-EMF",
-    ),
-    "current_limit_voltage": ("vi", "Current limit", "of the driver, times the resistance"),
-    "fast_decay_ratio": ("τₑf", "Fast-decay ratio", "electrical time constant in PWM periods"),
-    "coasting_share": ("s₀", "Coasting share", "share of back-EMF in the voltage at steady speed"),
-    "current_lag": ("τi", "Current lag", "mean lag of the current sensor"),
-    "encoder_error": ("e", "Encoder error", "amplitude of its error once a turn"),
-}
-"""Symbol, name and meaning of every quantity."""
+from smp_motor_ident.result import QUANTITIES, Quantity
 
 MODELS: Mapping[str, str] = {
     "static_gain": "static gain: no lag that these data show",
@@ -78,8 +41,8 @@ MAX_DIGITS = 9  # of a number: more are those of a simulation without noise
 
 def label(name: str) -> str:
     """Return a wheel, quantity or model in words."""
-    if name in EXPLAINED:
-        return EXPLAINED[name][1]
+    if name in QUANTITIES:
+        return QUANTITIES[name][2]
     return name.replace("_", " ").strip().capitalize()
 
 
@@ -182,13 +145,7 @@ def systematic(quantity: Quantity) -> str:
 
 
 def cause(name: str) -> str:
-    """Return a cause of systematic uncertainty in words.
-
-    Examples
-    --------
-    >>> cause("low_passed_speed"), cause("load_step")
-    ('speed low-pass', 'load step')
-    """
+    """Return a cause of systematic uncertainty in words."""
     return CAUSES.get(name, name.replace("_", " "))
 
 
@@ -224,7 +181,7 @@ def status(quantity: Quantity) -> str:
 
 def to_sentence(text: str) -> str:
     """Return a message as a sentence, with the names of quantities in words."""
-    known = {**EXPLAINED, **MODELS}
+    known = {**QUANTITIES, **MODELS}
     text = re.sub(
         r"\b[a-z]+(_[a-z]+)+\b(?!=)",
         lambda m: put_within(m[0]) if m[0] in known else m[0],
