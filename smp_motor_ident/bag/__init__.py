@@ -3,42 +3,18 @@
 
 `read_records` gives one `smp_motor_ident.record.Record` per wheel, whatever the format; a
 mapping says which topics, fields or columns are which signals where the messages are not ours.
-`BagWriter` writes.  Each is imported when it is first asked for: who writes needs no reader.
+`BagWriter` writes.
 """
 
 from importlib import import_module
-from typing import TYPE_CHECKING, Any
-
-if TYPE_CHECKING:
-    from smp_motor_ident.bag.mapping import MotorMap, Signal, SignalMap, load_mapping, parse_mapping
-    from smp_motor_ident.bag.propose import list_topics
-    from smp_motor_ident.bag.read import join_records, read_experiments, read_records
-    from smp_motor_ident.bag.topics import Listing, TopicInfo
-    from smp_motor_ident.bag.writer import BagWriter
-
-__all__ = [
-    "BagWriter",
-    "Listing",
-    "MotorMap",
-    "Signal",
-    "SignalMap",
-    "TopicInfo",
-    "join_records",
-    "list_topics",
-    "load_mapping",
-    "parse_mapping",
-    "read_experiments",
-    "read_records",
-]
+from typing import Any
 
 _HOMES = {
-    **dict.fromkeys(
-        ("MotorMap", "Signal", "SignalMap", "load_mapping", "parse_mapping"), "mapping"
-    ),
-    **dict.fromkeys(("Listing", "TopicInfo"), "topics"),
+    **dict.fromkeys(("Signal", "SignalMap", "load_mapping", "parse_mapping"), "mapping"),
     **dict.fromkeys(("join_records", "read_experiments", "read_records"), "read"),
-    **{"list_topics": "propose", "BagWriter": "writer"},
+    **{"Listing": "topics", "list_topics": "propose", "BagWriter": "writer"},
 }
+"""Public names, each imported when it is first asked for: who writes needs no reader."""
 
 
 def __getattr__(name: str) -> Any:

@@ -17,7 +17,7 @@ from typing import Any
 from smp_motor_control import WHEELS
 from smp_motor_control.motor.file import load_motors
 from smp_motor_control.wheel.protection import Bounds
-from smp_motor_ident import bag
+from smp_motor_ident.bag.read import read_experiments
 from smp_motor_ident.cli import checking, commission, driving, plan, protocol, steps
 from smp_motor_ident.cli.processes import ProcessError, Processes, connect
 from smp_motor_ident.cli.protocol import Protocol
@@ -209,7 +209,7 @@ def _record(session: Session, one: plan.Recording) -> None:
 def too_hot(folder: Path, earlier: Sequence[plan.Recording], last: plan.Recording) -> list[Finding]:
     """Return which windings must cool before the next signal."""
     before, now = (
-        bag.read_experiments([str(folder / r.folder / r.name) for r in some]) if some else {}
+        read_experiments([str(folder / r.folder / r.name) for r in some]) if some else {}
         for some in (earlier, [last])
     )
     return [
@@ -326,7 +326,7 @@ def validate_motors(
 ) -> list[Finding]:
     """Validate every motor on the held-out run."""
     found = []
-    read = {path: bag.read_experiments([str(path)]) for path in (fitted, held_out)}
+    read = {path: read_experiments([str(path)]) for path in (fitted, held_out)}
     for wheel, one in estimates.items():
         parts = [
             [validation_run.Simulated(r.time, *simulate(one, r)) for r in read[path][wheel]]

@@ -20,7 +20,8 @@ from typing import Any, cast
 
 import msgspec
 
-from smp_motor_ident import bag
+from smp_motor_ident.bag.mapping import SignalMap
+from smp_motor_ident.bag.read import read_experiments
 from smp_motor_ident.cli.workers import end_with_parent
 from smp_motor_ident.errors import BagError, ParameterError, SmpError
 from smp_motor_ident.estimate import estimate
@@ -36,7 +37,7 @@ Results = Iterator[tuple[str, list[fleet.Row]]]
 
 
 def work(
-    arguments: argparse.Namespace, mapping: bag.SignalMap | None, fixed: Mapping[str, float]
+    arguments: argparse.Namespace, mapping: SignalMap | None, fixed: Mapping[str, float]
 ) -> int:
     """Identify every recording by itself, and write the table."""
     folder = Path(arguments.output)
@@ -90,7 +91,7 @@ def identify_one(path: str, settings: tuple[Any, ...]) -> list[fleet.Row]:
     mapping, model, fixed = settings
     rows = []
     try:
-        for wheel, records in bag.read_experiments([path], mapping).items():
+        for wheel, records in read_experiments([path], mapping).items():
             dates = [one.recorded for one in records if one.recorded is not None]
             about: dict[str, Any] = dict(wheel=wheel, date=min(dates, default=None))
             try:

@@ -16,8 +16,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from smp_motor_ident import bag
 from smp_motor_ident import simulate as simulation
+from smp_motor_ident.bag.mapping import SignalMap, load_mapping, parse_mapping
+from smp_motor_ident.bag.read import read_experiments
 from smp_motor_ident.cli import frame, tables, workers
 from smp_motor_ident.cli.identify import NAME
 from smp_motor_ident.compilation import load
@@ -67,7 +68,7 @@ class Outcome:
 def work(arguments: argparse.Namespace) -> int:
     """Run the command and return its exit code."""
     if arguments.topics:
-        return tables.list_topics(arguments.bags, arguments.msg, NAME)
+        return tables.print_topics(arguments.bags, arguments.msg, NAME)
     loop = None if arguments.controller is None else reconstruction(arguments)
     mapping = signal_map(arguments) if loop is None else setpoint_map(arguments)
     if not arguments.output:
@@ -132,23 +133,23 @@ def _numbers(items: Sequence[str], option: str, known: Mapping[str, object]) -> 
     return numbers
 
 
-def signal_map(arguments: argparse.Namespace) -> bag.SignalMap | None:
+def signal_map(arguments: argparse.Namespace) -> SignalMap | None:
     """Return the mapping in the arguments."""
     if arguments.map and arguments.mapping:
         raise ParameterError("--map and --mapping exclude each other; write all into the file")
     if arguments.mapping:
-        loaded = bag.load_mapping(arguments.mapping)
+        loaded = load_mapping(arguments.mapping)
         return replace(loaded, msg_files=(*loaded.msg_files, *arguments.msg))
     if not (arguments.map or arguments.msg):
         return None
-    return bag.parse_mapping(arguments.map, arguments.msg)
+    return parse_mapping(arguments.map, arguments.msg)
 
 
 def _read(
-    paths: Sequence[str], mapping: bag.SignalMap | None, wheels: Sequence[str]
+    paths: Sequence[str], mapping: SignalMap | None, wheels: Sequence[str]
 ) -> dict[str, list[Record]]:
     """Read the requested wheels, or all."""
-    found = bag.read_experiments(list(paths), mapping)
+    found = read_experiments(list(paths), mapping)
     for wheel in wheels:
         if wheel not in found:
             raise BagError(f"{', '.join(paths)}: has no wheel {wheel!r}; it has {', '.join(found)}")
@@ -292,7 +293,7 @@ _SETPOINT = re.compile(r"(^|\s|\.)setpoint=")
 Reconstruct = Callable[[Record], Record]
 
 
-def setpoint_map(arguments: argparse.Namespace) -> bag.SignalMap:
+def setpoint_map(arguments: argparse.Namespace) -> SignalMap:
     """Return the mapping, with the set-point in place of the voltage."""
     items: list[str] = arguments.map
     if arguments.mapping or not any(_SETPOINT.search(item) for item in items):
@@ -302,9 +303,7 @@ def setpoint_map(arguments: argparse.Namespace) -> bag.SignalMap:
         )
     if any(re.search(r"(^|\s|\.)voltage=", item) for item in items):
         raise ParameterError("--controller computes the voltage; leave out voltage=")
-    mapping = bag.parse_mapping(
-        [_SETPOINT.sub(r"\1voltage=", item) for item in items], arguments.msg
-    )
+    mapping = parse_mapping([_SETPOINT.sub(r"\1voltage=", item) for item in items], arguments.msg)
     motors = {}
     for wheel, plan in mapping.motors.items():
         signals = dict(plan.signals)

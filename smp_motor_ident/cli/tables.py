@@ -10,7 +10,8 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from smp_motor_ident import bag
+from smp_motor_ident.bag.propose import list_topics
+from smp_motor_ident.bag.topics import TopicInfo
 from smp_motor_ident.cli.frame import progress
 from smp_motor_ident.report import summary, words
 from smp_motor_ident.result import Estimate
@@ -83,12 +84,12 @@ _WHAT_TO_MAP = (
 )
 
 
-def list_topics(paths: Sequence[str], msg_files: Sequence[str], program: str) -> int:
+def print_topics(paths: Sequence[str], msg_files: Sequence[str], program: str) -> int:
     """Print the topics of recordings, and a suggested mapping."""
     out = console()
     with progress(program) as say:
         say("reading")
-        listings = bag.list_topics(list(paths), msg_files)
+        listings = list_topics(list(paths), msg_files)
     for listing in listings:
         out.print(listing.name, style="bold")
         for info in listing.topics:
@@ -109,7 +110,7 @@ def list_topics(paths: Sequence[str], msg_files: Sequence[str], program: str) ->
     return 0
 
 
-def _print_topic(out: Console, info: bag.TopicInfo) -> None:
+def _print_topic(out: Console, info: TopicInfo) -> None:
     fields = ", ".join(info.fields[:MAX_FIELDS])
     if len(info.fields) > MAX_FIELDS:
         fields += f", ... ({len(info.fields)} fields)"

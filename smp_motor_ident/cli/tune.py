@@ -16,92 +16,54 @@ FORMATS = (
 )  # fmt: skip
 SPEED_SOURCES = ("measured", "difference", "observer")
 
-AIMS: dict[str, dict[str, Any]] = {
-    "phase_margin": dict(
-        type=float, metavar="DEG", help="required phase margin; default of the method margin: 60"
-    ),
-    "maximum_sensitivity": dict(
-        type=float,
-        metavar="MS",
-        help="largest sensitivity peak Ms; default of the method margin: 1.4",
-    ),
-    "focus": dict(
-        choices=("balanced", "tracking", "load"),
-        help="what the method margin favours: set-points, loads or both (default)",
-    ),
-    "bandwidth": dict(type=float, metavar="RAD/S", help="crossover frequency of the method margin"),
-    "structure": dict(choices=("pi", "pid"), help="of the controller; default: the better one"),
-    "closed_loop_time_constant": dict(type=float, metavar="S", help="of the method simc"),
-    "natural_frequency": dict(
-        type=float, metavar="RAD/S", help="of the method pole_placement; default: the highest"
-    ),
-    "damping": dict(type=float, metavar="RATIO", help="of the method pole_placement; default 0.8"),
-    "max_velocity": dict(type=float, metavar="RAD/S", help="limit of the set-point at the wheel"),
-    "max_acceleration": dict(
-        type=float, metavar="RAD/S2", help="limit of the reference at the wheel"
-    ),
-    "transition_time": dict(
-        type=float, metavar="S", help="duration of a change of set-point; default: the shortest"
-    ),
-    "rule": dict(choices=("tyreus_luyben", "ziegler_nichols"), help="rule of --relay"),
-}
-"""Arguments for the targets of the design."""
-
-LOOP: dict[str, dict[str, Any]] = {
-    "rate": dict(type=float, metavar="HZ", help="sampling rate of the loop"),
-    "delay": dict(
-        type=float, metavar="S",
-        help="longest delay from measurement to voltage, without the hold; default: one sample",
-    ),
-    "bag": dict(
-        type=Path,
-        help="measure both delays in a bag with motor_state and motor_command of driving wheels",
-    ),
-    "usual_delay": dict(type=float, metavar="S", help="usual delay; default: --delay"),
-    "speed_source": dict(
-        choices=("auto", *SPEED_SOURCES), default="auto",
-        help="default auto: the source that allows the largest gains",
-    ),
-    "difference_window": dict(
-        type=int, metavar="SAMPLES", help="samples over which counts are differenced"
-    ),
-    "speed_noise": dict(type=float, metavar="RAD/S",
-                        help="standard deviation of the reported speed, at the motor shaft"),
-    "angle_noise": dict(type=float, metavar="RAD",
-                        help="standard deviation of an angle that is differenced, at the motor "
-                        "shaft"),
-    "gear_ratio": dict(type=float, metavar="RATIO", help="motor revolutions per wheel revolution"),
-    "counts_per_revolution": dict(type=float, metavar="COUNTS", help="counts per motor revolution"),
-    "supply": dict(type=float, metavar="V", help="supply voltage"),
-}  # fmt: skip
-
-RUNNING: dict[str, dict[str, Any]] = {
-    "apply": dict(
-        action="store_true",
-        help="set the gains in the running wheels, and restore the old ones if a loop misbehaves",
-    ),
-    "gains": dict(
-        type=Path, metavar="FILE", help="with --apply, instead of a source: parameter file to apply"
-    ),
-    "watch": dict(type=float, default=3.0, metavar="S", help="length of the trial; default 3"),
-    "relay": dict(metavar="WHEEL", help="tune this wheel by relay feedback, without a model"),
-    "relay_amplitude": dict(
-        type=float, metavar="V", help="of the output; default: a quarter of the supply"
-    ),
-    "relay_hysteresis": dict(
-        type=float, default=0.05, metavar="RAD/S", help="of the speed at the wheel; default 0.05"
-    ),
-    "relay_seconds": dict(
-        type=float, default=4.0, metavar="S", help="length of the test; default 4"
-    ),
-}
-GROUPS = {
+# Each row: name, type or choices, unit, help, and a default other than None
+LOOP = (
+    ("rate", float, "HZ", "sampling rate of the loop"),
+    ("delay", float, "S",
+     "longest delay from measurement to voltage, without the hold; default: one sample"),
+    ("bag", Path, None,
+     "measure both delays in a bag with motor_state and motor_command of driving wheels"),
+    ("usual_delay", float, "S", "usual delay; default: --delay"),
+    ("speed_source", ("auto", *SPEED_SOURCES), None,
+     "default auto: the source that allows the largest gains", "auto"),
+    ("difference_window", int, "SAMPLES", "samples over which counts are differenced"),
+    ("speed_noise", float, "RAD/S", "standard deviation of the reported speed, at the motor shaft"),
+    ("angle_noise", float, "RAD",
+     "standard deviation of an angle that is differenced, at the motor shaft"),
+    ("gear_ratio", float, "RATIO", "motor revolutions per wheel revolution"),
+    ("counts_per_revolution", float, "COUNTS", "counts per motor revolution"),
+    ("supply", float, "V", "supply voltage"),
+)  # fmt: skip
+AIMS = (
+    ("phase_margin", float, "DEG", "required phase margin; default of the method margin: 60"),
+    ("maximum_sensitivity", float, "MS",
+     "largest sensitivity peak Ms; default of the method margin: 1.4"),
+    ("focus", ("balanced", "tracking", "load"), None,
+     "what the method margin favours: set-points, loads or both (default)"),
+    ("bandwidth", float, "RAD/S", "crossover frequency of the method margin"),
+    ("structure", ("pi", "pid"), None, "of the controller; default: the better one"),
+    ("closed_loop_time_constant", float, "S", "of the method simc"),
+    ("natural_frequency", float, "RAD/S", "of the method pole_placement; default: the highest"),
+    ("damping", float, "RATIO", "of the method pole_placement; default 0.8"),
+    ("max_velocity", float, "RAD/S", "limit of the set-point at the wheel"),
+    ("max_acceleration", float, "RAD/S2", "limit of the reference at the wheel"),
+    ("transition_time", float, "S", "duration of a change of set-point; default: the shortest"),
+    ("rule", ("tyreus_luyben", "ziegler_nichols"), None, "rule of --relay"),
+)  # fmt: skip
+RUNNING = (
+    ("gains", Path, "FILE", "with --apply, instead of a source: parameter file to apply"),
+    ("watch", float, "S", "length of the trial; default 3", 3.0),
+    ("relay", str, "WHEEL", "tune this wheel by relay feedback, without a model"),
+    ("relay_amplitude", float, "V", "of the output; default: a quarter of the supply"),
+    ("relay_hysteresis", float, "RAD/S", "of the speed at the wheel; default 0.05", 0.05),
+    ("relay_seconds", float, "S", "length of the test; default 4", 4.0),
+)
+GROUPS: dict[str, tuple[tuple[Any, ...], ...]] = {
     "the loop (default: as recorded or identified)": LOOP,
     "targets": AIMS,
     "running wheels": RUNNING,
 }
-
-TARGETS = (*AIMS, "relay_amplitude", "accept_unreliable")
+TARGETS = (*(row[0] for row in AIMS), "relay_amplitude", "accept_unreliable")
 
 
 def parser() -> frame.Parser:
@@ -113,37 +75,32 @@ def parser() -> frame.Parser:
     p = frame.Parser(prog="tune", description=about, epilog=frame.OF_ROS)
     add = p.add_argument
     add("source", type=Path, nargs="?", help="identification.json, its folder, or motors.yaml")
-    add(
-        "--output",
-        type=Path,
-        metavar="FILE",
-        help="parameter file to write (.yaml); gains.json and a figure go to the same folder",
-    )
-    add(
-        "--export", choices=FORMATS, metavar="FORMAT",
-        help="gains for another controller, at its usual rate: " + ", ".join(FORMATS),
-    )  # fmt: skip
+    add("--output", type=Path, metavar="FILE",
+        help="parameter file to write (.yaml), next to gains.json and a figure")  # fmt: skip
+    add("--export", choices=FORMATS, metavar="FORMAT",
+        help="gains for another controller, at its usual rate: " + ", ".join(FORMATS))  # fmt: skip
     add("--method", default="margin", help=f"{', '.join(METHODS)}; default margin")
-    add(
-        "--compare",
-        action="store_true",
-        help="print the designs of all methods and use the recommended one",
-    )
-    add(
-        "--alone", action="store_true",
-        help="plan each wheel as fast as its voltage allows, instead of all together",
-    )  # fmt: skip
+    add("--compare", action="store_true",
+        help="print the designs of all methods and use the recommended one")  # fmt: skip
+    add("--alone", action="store_true",
+        help="plan each wheel as fast as its voltage allows, instead of all together")  # fmt: skip
     add("--sets", choices=("auto", "one", "each"), default="auto",
         help="one set of gains for all wheels, or one each; auto: one if it suffices")  # fmt: skip
-    add(
-        "--accept-unreliable", action="store_true", default=None,
-        help="design on an unreliable identification, with a larger uncertainty",
-    )  # fmt: skip
+    add("--accept-unreliable", action="store_true", default=None,
+        help="design on an unreliable identification, with a larger uncertainty")  # fmt: skip
     add("--force", action="store_true", help="replace existing files")
-    for title, arguments in GROUPS.items():
+    for title, rows in GROUPS.items():
         group = p.add_argument_group(title)
-        for name, options in arguments.items():
+        for name, kind, unit, text, *default in rows:
+            how = {"choices": kind} if isinstance(kind, tuple) else {"type": kind, "metavar": unit}
+            options: dict[str, Any] = {
+                **how,
+                "help": text,
+                "default": default[0] if default else None,
+            }
             group.add_argument("--" + name.replace("_", "-"), **options)
+    group.add_argument("--apply", action="store_true", help="set the gains in the running wheels, "
+        "and restore the old ones if a loop misbehaves")  # fmt: skip
     return p
 
 

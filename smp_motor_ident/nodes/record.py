@@ -28,8 +28,7 @@ from smp_motor_control.nodes.publishers import (
     describe_two_publishers,
 )
 from smp_motor_control.ros_arguments import split_arguments
-from smp_motor_ident.bag import BagWriter
-from smp_motor_ident.bag.writer import DEFAULT_QOS
+from smp_motor_ident.bag.writer import DEFAULT_QOS, BagWriter
 from smp_motor_ident.nodes.bag_arguments import Choice, chosen, message_class, quality
 
 TAKE_PERIOD = 0.004
