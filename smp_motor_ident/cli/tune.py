@@ -8,9 +8,7 @@ from typing import Any
 from smp_motor_ident.cli import frame
 
 # Names of modules' contents that load only after the arguments are parsed; a test compares them.
-METHODS = (
-    "margin", "pole_placement", "simc", "ziegler_nichols", "tyreus_luyben", "relay",
-)  # fmt: skip
+METHODS = ("margin", "pole_placement", "simc", "ziegler_nichols", "tyreus_luyben")
 FORMATS = (
     "ros2_controllers", "linorobot2", "ros_arduino_bridge", "arduino_pid", "wpilib",
 )  # fmt: skip
@@ -48,7 +46,6 @@ AIMS = (
     ("max_velocity", float, "RAD/S", "limit of the set-point at the wheel"),
     ("max_acceleration", float, "RAD/S2", "limit of the reference at the wheel"),
     ("transition_time", float, "S", "duration of a change of set-point; default: the shortest"),
-    ("rule", ("tyreus_luyben", "ziegler_nichols"), None, "rule of --relay"),
 )  # fmt: skip
 RUNNING = (
     ("gains", Path, "FILE", "with --apply, instead of a source: parameter file to apply"),
@@ -57,13 +54,14 @@ RUNNING = (
     ("relay_amplitude", float, "V", "of the output; default: a quarter of the supply"),
     ("relay_hysteresis", float, "RAD/S", "of the speed at the wheel; default 0.05", 0.05),
     ("relay_seconds", float, "S", "length of the test; default 4", 4.0),
+    ("rule", ("tyreus_luyben", "ziegler_nichols"), None, "rule of --relay"),
 )
 GROUPS: dict[str, tuple[tuple[Any, ...], ...]] = {
     "the loop (default: as recorded or identified)": LOOP,
     "targets": AIMS,
     "running wheels": RUNNING,
 }
-TARGETS = (*(row[0] for row in AIMS), "relay_amplitude", "accept_unreliable")
+TARGETS = (*(row[0] for row in AIMS), "accept_unreliable")
 
 
 def parser() -> frame.Parser:

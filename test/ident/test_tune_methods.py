@@ -14,8 +14,8 @@ from smp_motor_ident.tune.margins import loop_margins
 from smp_motor_ident.tune.methods import METHODS
 from smp_motor_ident.tune.methods.margin import at_sensitivity
 from smp_motor_ident.tune.methods.pole_placement import place
-from smp_motor_ident.tune.methods.relay import oscillate, read_oscillation
-from smp_motor_ident.tune.methods.rules import from_ultimate
+from smp_motor_ident.tune.methods.relay import read_oscillation
+from smp_motor_ident.tune.methods.rules import by_rule
 from smp_motor_ident.tune.motors import Motors
 from smp_motor_ident.tune.plant import sample
 from smp_motor_ident.tune.problem import FirstOrderDelay, Problem
@@ -45,13 +45,12 @@ class Reduced(Problem):
 
 
 def test_ziegler_nichols_and_tyreus_luyben_give_their_published_shares():
-    one, full = problem(), problem(structure="pid")
-    assert from_ultimate(one, "ziegler_nichols", 2.0, 1.2) == Feedback(0.9, 0.9)
-    pid = from_ultimate(full, "ziegler_nichols", 2.0, 1.0)
+    assert by_rule("ziegler_nichols", "pi", 2.0, 1.2) == Feedback(0.9, 0.9)
+    pid = by_rule("ziegler_nichols", "pid", 2.0, 1.0)
     assert (pid.p, pid.p / pid.i, pid.d / pid.p) == pytest.approx((1.2, 0.5, 0.125))
-    pi = from_ultimate(one, "tyreus_luyben", 3.2, 1.0)
+    pi = by_rule("tyreus_luyben", "pi", 3.2, 1.0)
     assert (pi.p, pi.p / pi.i) == pytest.approx((1.0, 2.2))
-    pid = from_ultimate(full, "tyreus_luyben", 2.2, 6.3)
+    pid = by_rule("tyreus_luyben", "pid", 2.2, 6.3)
     assert (pid.p, pid.p / pid.i, pid.d / pid.p) == pytest.approx((1.0, 2.2 * 6.3, 1.0))
 
 
@@ -95,6 +94,35 @@ def test_ultimate_gain_is_where_proportional_control_turns_unstable():
         # The idle integrator stays at 1.
         assert (np.sort(poles)[-2] < 1) == stable or (np.sort(poles)[-1] <= 1 + 1e-9) == stable
     assert period > 4 * one.loop.sample_time
+
+
+def oscillate(problem, amplitude, hysteresis, seconds):
+    """Run the sampled loop with a relay in place of the controller."""
+    plant, count = problem.plant, problem.loop.count_angle
+    T, window = plant.sample_time, plant.window
+    steps = int(seconds / T)
+    phi, taps = plant.phi[0], plant.taps[0]
+    phi_angle, taps_angle = plant.phi_angle[0], plant.taps_angle[0]
+    average = plant.average[0]
+    x, past = np.zeros(phi.shape[0]), np.zeros(taps.shape[0])
+    angle = np.zeros(window + 1)
+    voltage, speed = np.empty(steps), np.empty(steps)
+    output = amplitude
+    for k in range(steps):
+        if window:
+            counted = np.floor(angle / count) * count if count else angle
+            measured = -np.diff(counted) @ average
+        else:
+            measured = x[plant.sensor]
+        if measured > hysteresis:
+            output = -amplitude
+        elif measured < -hysteresis:
+            output = amplitude
+        past[1:], past[0] = past[:-1].copy(), output
+        angle[1:], angle[0] = angle[:-1].copy(), angle[0] + phi_angle @ x + taps_angle @ past
+        x = phi @ x + past @ taps
+        voltage[k], speed[k] = output, measured
+    return voltage, speed
 
 
 @pytest.mark.parametrize("coefficients", PAPER)
