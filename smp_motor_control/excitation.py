@@ -72,11 +72,13 @@ class Square(Excitation):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Band(Excitation):
-    """Signal with frequencies from ``lowest`` to ``highest`` [Hz]."""
+class Fourier(Excitation):
+    """Multisine of incommensurate, logarithmically spaced tones; rare peaks are clipped."""
 
-    lowest: float = 0.1
-    highest: float = 20.0
+    lowest: float = 0.1  # [Hz]
+    highest: float = 20.0  # [Hz]
+    tones: int = 24
+    seed: int = 0  # signals of different seeds are nearly uncorrelated
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -84,17 +86,6 @@ class Band(Excitation):
             raise ParameterError(
                 f"highest is {self.highest!r} Hz; it must be above lowest, {self.lowest!r} Hz"
             )
-
-
-@dataclass(frozen=True, kw_only=True)
-class Fourier(Band):
-    """Multisine of incommensurate, logarithmically spaced tones; rare peaks are clipped."""
-
-    tones: int = 24
-    seed: int = 0  # signals of different seeds are nearly uncorrelated
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
         if self.tones < 2:
             raise ParameterError(f"tones is {self.tones!r}; it must be at least 2")
 
@@ -143,24 +134,6 @@ def _multisine(lowest: float, highest: float, tones: int, seed: int) -> tuple[Ar
         draws[best],
         min(float(peaks[best]), _MAX_CREST_FACTOR * math.sqrt(tones / 2)),
     )
-
-
-@dataclass(frozen=True, kw_only=True)
-class Chirp(Band):
-    """Sine whose frequency rises and falls exponentially, periodically."""
-
-    sweep: float = 20.0  # time from the lowest to the highest frequency [s]
-
-    def _shape(self, time: Array) -> Array:
-        sweep = self.sweep * DETUNING
-        growth = math.log(self.highest / self.lowest) / sweep
-        whole = self.lowest / growth * math.expm1(growth * sweep)
-        count, rest = np.divmod(time, sweep)
-        up = self.lowest / growth * np.expm1(growth * rest)
-        down = whole - self.lowest / growth * np.expm1(growth * (sweep - rest))
-        turns = count * whole + np.where(count % 2 == 0, up, down)
-        swept: Array = np.sin(2 * math.pi * turns)
-        return swept
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -233,6 +206,6 @@ class Bounded(Excitation):
 
 
 SIGNALS: dict[str, type[Excitation]] = {
-    kind.__name__.lower(): kind for kind in (Sine, Square, Fourier, Chirp, Prbs, Steps, Ramp)
+    kind.__name__.lower(): kind for kind in (Sine, Square, Fourier, Prbs, Steps, Ramp)
 }
 """Signals by their names in tools and in the ``excite`` node."""

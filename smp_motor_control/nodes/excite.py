@@ -53,10 +53,9 @@ class Settings:
     seed: int = fixed(0, "Seed of fourier, prbs and steps.", minimum=0)
     independent: bool = fixed(True, "Whether the wheels' random signals differ.")
     frequency: float = fixed(1.0, "Frequency of sine and square [Hz].", minimum=0.0)
-    lowest: float = fixed(0.1, "Lowest frequency of fourier and chirp [Hz].", minimum=0.0)
-    highest: float = fixed(20.0, "Highest frequency of fourier and chirp [Hz].", minimum=0.0)
+    lowest: float = fixed(0.1, "Lowest frequency of fourier [Hz].", minimum=0.0)
+    highest: float = fixed(20.0, "Highest frequency of fourier [Hz].", minimum=0.0)
     tones: int = fixed(24, "Number of tones of fourier.", minimum=2, maximum=1000)
-    sweep: float = fixed(20.0, "Duration of a sweep of chirp [s].", minimum=0.0)
     hold: float = fixed(0.0, "Step length of prbs and steps [s]; 0: default.", minimum=0.0)
     period: float = fixed(20.0, "Period of ramp [s].", minimum=0.0)
 

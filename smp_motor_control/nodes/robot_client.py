@@ -44,7 +44,6 @@ RETRY_PERIOD_S = 0.25
 this client; requests must be idempotent."""
 
 POLL_PERIOD_S = 0.02
-DECISIVE_SAMPLES = 30  # states of a wheel that show whether one node publishes them
 DISCOVERY_S = 1.0  # discovery time on an idle machine
 HALT_S = 1.5  # halt after which the last commands of others have timed out
 GET, SET = "get_parameters", "set_parameters_atomically"
@@ -178,23 +177,6 @@ class RobotClient:
                 f"no message on {topic} within {timeout:.0f} s; is the hardware's driver running?"
             )
         return {w: (len(s) - 1) / (s[-1] - s[0]) for w, s in stamps.items()}
-
-    def refuse_second_reporters(self, wheels: Iterable[str]) -> None:
-        """Raise when two nodes publish the state of one wheel."""
-        watches = {wheel: PublisherWatch() for wheel in wheels}
-        heard = dict.fromkeys(watches, 0)
-
-        def take(wheel: str, message: MotorState, info: Mapping[str, Any]) -> None:
-            watches[wheel].hear(info)
-            heard[wheel] += 1
-
-        def decided() -> bool:
-            seen = min(heard.values(), default=DECISIVE_SAMPLES) >= DECISIVE_SAMPLES
-            return seen or any(one.has_two_publishers for one in watches.values())
-
-        with self.listen_to_wheels(MotorState, "motor_state", watches, take):
-            self.until(decided, DISCOVERY_S)
-        self._refuse_doubled(watches)
 
     def _refuse_doubled(self, watches: Mapping[str, PublisherWatch]) -> None:
         topics = [

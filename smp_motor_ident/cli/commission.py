@@ -37,7 +37,6 @@ def parser() -> Parser:
     add("--apply", action="store_true", help="keep gains that pass in the running controllers")
     add("--resume", action="store_true", help="continue an interrupted run in DIR")
     add("--dry-run", action="store_true", help="print the plan; nothing moves")
-    add("--tuning", action="store_true", help="add the tuning page to the report (takes longer)")
     add("--yes", "-y", action="store_true", help="do not ask before the wheels move")
     return made
 

@@ -34,6 +34,7 @@ AMPLITUDE, DURATION = 6.0, 15.0
 
 DRAFT = "recording"  # folder of a recording until it is whole
 DISCOVERY_S = 2.0  # a controller that runs is discovered by then [s]
+REPORT_TIMEOUT_S = 15.0  # of the first states of all wheels
 LOOKS, ALIKE = 15, 4
 """Largest number of searches for wheels [1 s each], and equal results in a row that end them."""
 
@@ -87,8 +88,7 @@ def _commission(arguments: argparse.Namespace, folder: Path, known: Mapping[str,
         _say("looking for the wheels that report, which takes some 5 s")
         wheels = tuple(dict.fromkeys(arguments.wheel or ())) or find_wheels(client)
         robot = steps.Robot(processes, client, wheels or WHEELS, folder, ros, bounds)
-        rates = client.wait_for_wheels(robot.wheels, timeout=15.0)
-        client.refuse_second_reporters(robot.wheels)
+        rates = client.wait_for_wheels(robot.wheels, REPORT_TIMEOUT_S)
         print("; ".join(f"{wheel} reports at {rate:.0f} Hz" for wheel, rate in rates.items()))
         session = _begin(arguments, robot)
         if session is None:
@@ -120,10 +120,10 @@ def _begin(arguments: argparse.Namespace, robot: steps.Robot) -> Session | None:
             _say("wheels, amplitude or duration have changed: all steps are repeated")
         made.begin(robot.wheels, asked)
     left = [one for one in _recordings(arguments, made) if not (same and _is_kept(robot, one))]
-    if left or (arguments.tuning and not made.has("tuning_page")):
+    if left:
         made.mark(identified=False, judged=False, tuned=False)
     parts = {part: made.has(part) for part in ("checked", "identified", "tuned")}
-    schedule = plan.schedule(robot.wheels, left, **parts, tuning_page=arguments.tuning)
+    schedule = plan.schedule(robot.wheels, left, **parts)
     session = Session(arguments, robot, made, schedule)
     _tell_controllers(arguments, robot)
     _confirm(arguments, robot.wheels, left, schedule)
@@ -184,7 +184,7 @@ def _check(session: Session, known: Mapping[str, Any]) -> None:
 def _record(session: Session, one: plan.Recording) -> None:
     """Record the wheels under one signal; stop them at the end in any case."""
     arguments, robot = session.arguments, session.robot
-    robot.client.refuse_second_reporters(robot.wheels)
+    robot.client.wait_for_wheels(robot.wheels, REPORT_TIMEOUT_S)
     speed = session.protocol.document.get("speed")
     if speed and not arguments.max_speed:
         fastest = MAX_SPEED_RATIO * float(speed)
@@ -251,13 +251,13 @@ def _design(session: Session) -> driving.Designed:
 
 def _identify(session: Session, part: str) -> dict[str, Estimate]:
     """Identify from all recordings, unless that is done."""
-    robot, made, tuning = session.robot, session.protocol, session.arguments.tuning
+    robot, made = session.robot, session.protocol
     results = robot.folder / "identification"
     if made.has("identified"):
         return read_identification(results)
     session.begin(part)
-    options = ["--force", "--quiet", "--accept-unreliable", *(["--tuning"] if tuning else [])]
-    options += ["--validate", str(robot.folder / plan.HELD_OUT)]
+    options = ["--force", "--quiet", "--accept-unreliable", "--validate"]
+    options.append(str(robot.folder / plan.HELD_OUT))
     options += [part for wheel in robot.wheels for part in ("--wheel", wheel)]
     try:
         estimates = steps.identify_wheels(robot.folder / plan.FITTED, results, *options)
@@ -265,7 +265,7 @@ def _identify(session: Session, part: str) -> dict[str, Estimate]:
         if (results / "identification.json").is_file():
             made.stop(made.add("identification", unreliable(read_identification(results))))
         raise
-    made.mark(identified=True, tuning_page=bool(tuning), judged=False, tuned=False)
+    made.mark(identified=True, judged=False, tuned=False)
     made.write()
     return estimates
 
@@ -273,7 +273,7 @@ def _identify(session: Session, part: str) -> dict[str, Estimate]:
 def _verify(session: Session, designed: driving.Designed) -> str:
     """Drive with the gains on trial, check the drive, and return the outcome."""
     robot, made = session.robot, session.protocol
-    robot.client.refuse_second_reporters(robot.wheels)
+    robot.client.wait_for_wheels(robot.wheels, REPORT_TIMEOUT_S)
     session.schedule.add(
         plan.DRIVING, "drive", plan.START + sum(one[2] for one in driving.plan_of(designed))
     )

@@ -35,7 +35,6 @@ CHECK, START, COMPUTE, DRIVE = 8.0, 4.0, 4.0, 12.0
 """First guesses [s]: the test of one wheel, the start and end of processes around a signal, the
 identification or tuning of one wheel, the drive."""
 
-PAGE_COST = 2  # times an identification that its tuning page takes
 DRAWN, COLUMNS, BLOCKS = 4.0, 72, "▁▂▃▄▅▆▇█"
 """So many seconds of a signal are drawn, on so many columns, with these levels."""
 
@@ -141,7 +140,6 @@ def schedule(
     checked: bool = False,
     identified: bool = False,
     tuned: bool = False,
-    tuning_page: bool = False,
 ) -> Schedule:
     """Return the parts of a commissioning that are not done yet."""
     made = Schedule()
@@ -150,8 +148,7 @@ def schedule(
     for part in parts:
         made.add(part.part, "signal", part.excitation.duration + START)
     if not identified:
-        pages = 1 + PAGE_COST * tuning_page
-        made.add(IDENTIFYING, "identify", pages * COMPUTE * len(wheels))
+        made.add(IDENTIFYING, "identify", COMPUTE * len(wheels))
     if not tuned:
         made.add(TUNING, "tune", COMPUTE * len(wheels))
     made.add(DRIVING, "drive", DRIVE)

@@ -73,11 +73,7 @@ def choose_source(estimate: Estimate, loop: Loop, **targets: Any) -> tuple[Loop,
         loop, speed_source="difference", difference_window=max(loop.difference_window, 1)
     )
     longer = _longer(estimate, counted, usual, targets)
-    # Dynamics that the residuals show may leave the estimates unchanged and still ring between
-    # motor and encoder.
-    shown = (f.message for f in estimate.findings if "explained_deviance" in f.evidence)
-    lacks = next((f"; not the observer, which depends on the model: {why}" for why in shown), "")
-    watched = None if lacks else _trial(estimate, replace(loop, speed_source="observer"), targets)
+    watched = _trial(estimate, replace(loop, speed_source="observer"), targets)
     best, unsettled = _best(usual, longer, watched)
     if best is None:
         return loop, "the reported speed: no source meets the targets"
@@ -87,7 +83,7 @@ def choose_source(estimate: Estimate, loop: Loop, **targets: Any) -> tuple[Loop,
         for t in (usual, longer, watched)
         if t is not None
     )
-    lacks += "".join(f"; not {t.name}: some motors do not settle with it" for t in unsettled)
+    lacks = "".join(f"; not {t.name}: some motors do not settle with it" for t in unsettled)
     return best.loop, f"{best.name}: {compared}{lacks}"
 
 

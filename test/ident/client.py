@@ -23,9 +23,6 @@ class Client:
     def paused(self, wheels) -> contextlib.AbstractContextManager[None]:
         return contextlib.nullcontext()
 
-    def refuse_second_reporters(self, wheels) -> None:
-        pass
-
     def until(self, condition, timeout) -> bool:
         return condition()
 

@@ -112,19 +112,6 @@ def test_at_1_khz_the_observer_is_chosen_with_its_reason(estimates):
     assert better.performance.control_noise <= 1.01 * 0.48
 
 
-def test_the_observer_is_not_chosen_for_an_inadequate_model(estimates):
-    shown = Finding("backlash", "note", "the model's error shows backlash between motor and "
-                    "encoder", {"explained_deviance": 200.0})  # fmt: skip
-    given = replace(estimates["rear_left"], findings=(shown,))
-    loop, why = choose_source(given, Loop(sample_time=0.001))
-    assert loop.speed_source != "observer"
-    assert "not the observer, which depends on the model: the model's error shows backlash" in why
-    # An effect neither significant nor excluded is not a reason.
-    doubt = replace(shown, evidence={"p_value": 0.01})
-    unsure = replace(given, findings=(doubt,))
-    assert choose_source(unsure, Loop(sample_time=0.001))[0].speed_source == "observer"
-
-
 def test_at_200_hz_the_reported_speed_does(estimates):
     loop, _ = choose_source(estimates["rear_left"], Loop(sample_time=0.005))
     assert loop.speed_source == "measured"

@@ -122,19 +122,14 @@ def test_two_that_command_the_wheels_at_once_are_named(process, robot, eventuall
     eventually(lambda: both in robot.said["left/wheel_pid"], 20.0, robot.run, str(robot.said))
 
 
-@pytest.mark.parametrize("wait", [True, False])
-def test_a_client_refuses_a_wheel_of_two_publishers(robot, eventually, wait):
+def test_a_client_refuses_a_wheel_of_two_publishers(robot):
     with RobotClient(name="tool") as client:
         client.node.create_timer(0.01, robot.run)
         assert client.wait_for_wheels(WHEELS, 20.0)["left"] > 5.0
-        client.refuse_second_reporters(WHEELS)
         robot.forget()
         with pytest.raises(RobotError, match="comes from /driver and /forgotten at once"):  # noqa: PT012
             for _ in range(20):
-                if wait:
-                    client.wait_for_wheels(WHEELS, 20.0)
-                else:
-                    client.refuse_second_reporters(WHEELS)
+                client.wait_for_wheels(WHEELS, 20.0)
 
 
 def test_states_without_a_stamp_are_named_and_refused_by_tools(process, robot, eventually):
