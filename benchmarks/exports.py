@@ -87,19 +87,8 @@ def arduino_pid(n: Mapping[str, float], T: float) -> Law:
     return law
 
 
-def wpilib(n: Mapping[str, float], T: float) -> Law:
-    """Feed-forward of a constant speed, and kP."""
-
-    def law(r: float, y: float, counts: int) -> float:
-        volts = math.copysign(n["kS"], r) + n["kV"] * r / RATIO + n["kP"] * (r - y) / RATIO
-        return min(max(volts, -SUPPLY), SUPPLY)
-
-    return law
-
-
 LAWS = {
-    law.__name__: law
-    for law in (ros2_controllers, linorobot2, ros_arduino_bridge, arduino_pid, wpilib)
+    law.__name__: law for law in (ros2_controllers, linorobot2, ros_arduino_bridge, arduino_pid)
 }
 
 

@@ -432,7 +432,7 @@ def tuned(path: Path) -> str:
     """Return what ``tune`` makes of a file, which must be a text or one line."""
     out, err = io.StringIO(), io.StringIO()
     with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
-        code = main_of_tune([str(path), *TUNE, "wpilib"])
+        code = main_of_tune([str(path), *TUNE, "arduino_pid"])
     said = [s for s in err.getvalue().splitlines() if not s.startswith("tune: designing")]
     if code == 0:
         return "answer" if not said else "partial"

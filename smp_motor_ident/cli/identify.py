@@ -63,7 +63,7 @@ def parser() -> Parser:
     add(
         "--controller", nargs="+", metavar=("FORMAT", "GAIN=VALUE"),
         help="reconstruct the voltage from set-points (--map setpoint=...) of a known controller: "
-        "linorobot2, ros_arduino_bridge, arduino_pid, ros2_controllers or wpilib",
+        "linorobot2, ros_arduino_bridge, arduino_pid or ros2_controllers",
     )  # fmt: skip
     add("--topics", action="store_true", help="list the signals and propose a mapping")
     add("--fleet", action="store_true",

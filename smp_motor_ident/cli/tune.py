@@ -9,9 +9,7 @@ from smp_motor_ident.cli import frame
 
 # Names of modules' contents that load only after the arguments are parsed; a test compares them.
 METHODS = ("margin", "pole_placement", "simc", "ziegler_nichols", "tyreus_luyben")
-FORMATS = (
-    "ros2_controllers", "linorobot2", "ros_arduino_bridge", "arduino_pid", "wpilib",
-)  # fmt: skip
+FORMATS = ("ros2_controllers", "linorobot2", "ros_arduino_bridge", "arduino_pid")
 SPEED_SOURCES = ("measured", "difference", "observer")
 
 # Each row: name, type or choices, unit, help, and a default other than None

@@ -44,7 +44,6 @@ class KnownLoop:
     start: Callable[[Setting], Step]  # from a setting to the step of a loop that begins at rest
     # From the numbers to the loop's interval [s]; NaN where it is that of the log
     interval: Callable[[Mapping[str, float]], float] = lambda numbers: math.nan
-    remembers: bool = True  # whether a command depends on earlier samples
 
 
 def reconstruct(record: Record, loop: KnownLoop, numbers: Mapping[str, float]) -> Record:
@@ -65,7 +64,7 @@ def reconstruct(record: Record, loop: KnownLoop, numbers: Mapping[str, float]) -
     T = _interval(record, loop, numbers)
     record = _cut_at_lost_sample(record, T)
     assert record.velocity is not None
-    if loop.remembers and (record.voltage[1] != 0.0 or record.velocity[0] != 0.0):
+    if record.voltage[1] != 0.0 or record.velocity[0] != 0.0:
         raise SignalError(
             f"{where}: begins while the loop is running, with an unknown integral; "
             "record from rest, before the first set-point"

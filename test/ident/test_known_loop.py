@@ -30,7 +30,6 @@ LOOPS = {
          "tracking_time_constant": 0.1, "feedforward_gain": 0.0},
         1.0,
     ),
-    "wpilib": (0.02, {"kS": 0.2, "kV": 1.1, "kP": 0.5}, 1.0),
 }  # fmt: skip
 """Interval, gains, and the target's unit of a wheel's rad/s."""
 
@@ -155,7 +154,8 @@ def test_a_loop_that_is_not_given_whole_is_refused(arguments, complaint, tmp_pat
 
 
 def test_set_points_of_another_topic_are_refused(tmp_path, capsys):
-    code = main(["bag", "--controller", "wpilib", "kV=1", "kP=1", "--output", str(tmp_path / "r"),
-                 "--map", "setpoint=/cmd.data", "velocity=/state.speed"])  # fmt: skip
+    code = main(["bag", "--controller", "linorobot2", "K_P=1", "K_I=1", "--output",
+                 str(tmp_path / "r"), "--map", "setpoint=/cmd.data",
+                 "velocity=/state.speed"])  # fmt: skip
     assert code == 2
     assert "one message or row" in capsys.readouterr().err

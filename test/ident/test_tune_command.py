@@ -92,7 +92,7 @@ def test_every_step_is_announced_with_its_duration(identified, monkeypatch):
 
     monkeypatch.setattr(tuning.frame, "progress", progress)
     assert main([str(identified), "--compare"]) == 0
-    assert main([str(identified), "--export", "wpilib"]) == 0
+    assert main([str(identified), "--export", "arduino_pid"]) == 0
     assert len(told) == 4 and all(" takes about " in text for text in told), told
 
 
@@ -107,7 +107,7 @@ def test_small_gains_are_shown_with_their_digits():
     assert "0.000662" in row(design)
 
 
-@pytest.mark.parametrize("export", [[], ["--export", "wpilib"]])
+@pytest.mark.parametrize("export", [[], ["--export", "arduino_pid"]])
 def test_unwritable_folder_is_named_before_a_design(identified, capsys, monkeypatch, export):
     def design(*_: object, **__: object) -> None:
         raise AssertionError("designed before looking")

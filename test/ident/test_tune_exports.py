@@ -47,7 +47,6 @@ def test_export_writes_parameters_and_limitations(name, tmp_path, capsys):
         "linorobot2": ("#define K_P", "#define K_I"),
         "ros_arduino_bridge": ("int Kp = ", "// Ko: ", "#define PID_RATE 30  // 33 ms"),
         "arduino_pid": ("SetOutputLimits(-255, 255)", "rear_left_pid"),
-        "wpilib": ("kS = ", "kV = ", "kA = ", "kP = "),
         "ros2_controllers": ("pid_controller/PidController",),
     }[name]:
         assert word in text

@@ -29,9 +29,6 @@ class Gains:
     numbers: Mapping[str, float]  # as the target takes them
     feedback: Feedback  # the same, as rounded, as the feedback of the running loop
     weight: float = 1.0  # of the set-point in the proportional action [-]
-    # static, velocity: Feed-forward [V], [V s/rad]
-    static: float = 0.0
-    velocity: float = 0.0
     # Time constant of anti-windup that comes nearest to the target's [s]
     tracking: float = math.inf
     resting_error: float = 0.0  # below which whole numbers let an error be [rad/s, motor]
@@ -87,10 +84,8 @@ def check(design: Design, gains: Gains) -> Check:
     controller = Controller(
         gains.feedback, weight=gains.weight, limit=loop.supply_voltage, tracking=gains.tracking
     )
-    given = gains.static + gains.velocity * target
-    inputs = Inputs(np.full(time.size, target), forward=np.full(time.size, given))
     friction = np.array([design.motor["static_voltage"]])
-    run = simulate(plant, controller, inputs, friction=friction)
+    run = simulate(plant, controller, Inputs(np.full(time.size, target)), friction=friction)
     step = step_figures(time, run.speed[0], run.voltage[0], target)
     if gains.resting_error > SETTLING_BAND * target:
         step = replace(step, settling=math.nan)
@@ -100,19 +95,16 @@ def check(design: Design, gains: Gains) -> Check:
 def duration(design: Design, gains: Gains) -> float:
     """Return the simulated length of a change of set-point [s].
 
-    The slow mode of the integral decays with ``(p + a0) / i`` from the error that feed-forward and
-    proportional action leave, and from the integral of the rise; it is followed down to a tenth of
-    the settling band.
+    The slow mode of the integral decays with ``(p + a0) / i`` from the error that proportional
+    action leaves, and from the integral of the rise; it is followed down to a tenth of the settling
+    band.
     """
     fb, a0, rise = gains.feedback, 1 / design.motor["dc_gain"], design.motor["time_constant"]
-    tail = 0.0
-    if fb.i > 0:
-        slow = (fb.p + a0) / fb.i
-        target = STEP_SHARE * design.reference.max_velocity
-        needed = a0 + (design.motor["static_voltage"] - gains.static) / target
-        given = gains.velocity + fb.p * (gains.weight - 1)
-        left = abs(given - needed) / (fb.p + a0) + rise / slow
-        tail = slow * max(math.log(10 * left / SETTLING_BAND), 0.0)
+    slow = (fb.p + a0) / fb.i
+    target = STEP_SHARE * design.reference.max_velocity
+    needed = a0 + design.motor["static_voltage"] / target
+    left = abs(fb.p * (gains.weight - 1) - needed) / (fb.p + a0) + rise / slow
+    tail = slow * max(math.log(10 * left / SETTLING_BAND), 0.0)
     return float(0.5 + 12 * rise + tail)
 
 
