@@ -6,7 +6,6 @@ import sys
 import threading
 import time
 from collections import Counter
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +19,7 @@ from smp_motor_control.nodes import runtime
 from smp_motor_control.ros_arguments import split_arguments
 from smp_motor_ident.bag.replay import Replay, find_offered_qos
 from smp_motor_ident.bag.storage import Channel
-from smp_motor_ident.nodes.bag_arguments import chosen, message_class, quality
+from smp_motor_ident.nodes.bag_arguments import message_class, quality
 
 DEPTH = 1000
 DISCOVERY_TIME_S = 1.0
@@ -168,9 +167,6 @@ def parser() -> argparse.ArgumentParser:
     add = made.add_argument
     add("bag", metavar="BAG", help="folder of the bag, or a bare .mcap or .db3 file")
     add("--topics", nargs="+", default=[], metavar="TOPIC", help="play only these topics")
-    add("--regex", "-e", default="", metavar="PATTERN",
-        help="play only topics whose whole name matches")  # fmt: skip
-    add("--exclude", "-x", default="", metavar="PATTERN", help="leave out topics that match")
     add("--rate", "-r", type=float, default=1.0, metavar="R",
         help="speed of playback: 2 is twice as fast; default 1")  # fmt: skip
     add("--start-offset", type=float, default=0.0, metavar="S",
@@ -192,15 +188,13 @@ def _check(arguments: argparse.Namespace) -> None:
 
 
 def _chosen(replay: Replay, arguments: argparse.Namespace) -> list[Channel]:
-    choice = chosen(arguments, hidden=True)
-    names = {name if name.startswith("/") else f"/{name}" for name in choice.names}
+    names = {name if name.startswith("/") else f"/{name}" for name in arguments.topics}
     there = {channel.topic for channel in replay.channels}
     if missing := names - there:
         known = ", ".join(sorted(there)) or "none"
         raise SmpError(f"{arguments.bag}: has no topic {sorted(missing)[0]}; it has {known}")
-    choice = replace(choice, names=frozenset(names))
-    barred = "/clock" if arguments.clock else ""
-    return [c for c in replay.channels if c.topic != barred and choice.wants(c.topic)]
+    played = (names or there) - {"/clock" if arguments.clock else ""}
+    return [channel for channel in replay.channels if channel.topic in played]
 
 
 def main(argv: list[str] | None = None) -> int:

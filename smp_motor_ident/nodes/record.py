@@ -7,6 +7,7 @@ queue's reception stamps stay exact.
 """
 
 import argparse
+import re
 import shutil
 import sys
 from dataclasses import dataclass, field, replace
@@ -29,7 +30,7 @@ from smp_motor_control.nodes.publishers import (
 )
 from smp_motor_control.ros_arguments import split_arguments
 from smp_motor_ident.bag.writer import DEFAULT_QOS, BagWriter
-from smp_motor_ident.nodes.bag_arguments import Choice, chosen, message_class, quality
+from smp_motor_ident.nodes.bag_arguments import message_class, quality
 
 TAKE_PERIOD = 0.004
 LOOK_PERIOD = 0.05
@@ -38,6 +39,22 @@ DEPTH = 2000  # depth of the DDS queue per topic: two seconds of 1 kHz while the
 
 ONE_PUBLISHER = ("smp_interfaces/msg/MotorState", "smp_interfaces/msg/PidState")
 """Types with only one publisher per topic; others may have several."""
+
+
+@dataclass(frozen=True)
+class Choice:
+    """Topics to record; without names and a pattern all but those with a leading underscore."""
+
+    names: frozenset[str]
+    pattern: re.Pattern[str] | None = None
+    exclude: re.Pattern[str] | None = None
+
+    def wants(self, topic: str) -> bool:
+        if self.exclude and self.exclude.fullmatch(topic):
+            return False
+        if topic in self.names or "/_" in topic:
+            return topic in self.names
+        return bool(self.pattern.fullmatch(topic)) if self.pattern else not self.names
 
 
 @dataclass
@@ -192,15 +209,20 @@ def parser() -> argparse.ArgumentParser:
     add = made.add_argument
     add("topics", nargs="*", metavar="TOPIC", help="topics to record (default: all)")
     add("--output", "-o", metavar="DIR", help="folder of the bag (default: rosbag2_DATE)")
-    add("--all", "-a", action="store_true", help="record all topics (the default)")
-    add("--regex", "-e", default="", metavar="PATTERN",
+    add("--regex", "-e", type=_pattern, metavar="PATTERN",
         help="record topics whose whole name matches")  # fmt: skip
-    add("--exclude", "-x", default="", metavar="PATTERN", help="leave out topics that match")
-    add("--include-hidden", action="store_true", help="record topics with a leading underscore too")
+    add("--exclude", "-x", type=_pattern, metavar="PATTERN", help="leave out topics that match")
     add("--duration", "-d", type=float, default=0.0, metavar="S",
         help="end after this time; default: at Ctrl-C")  # fmt: skip
     add("--force", action="store_true", help="replace an existing bag")
     return made
+
+
+def _pattern(text: str) -> re.Pattern[str]:
+    try:
+        return re.compile(text)
+    except re.error as error:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a regular expression: {error}") from None
 
 
 def _make_room(path: Path, force: bool) -> None:
@@ -220,9 +242,7 @@ def main(argv: list[str] | None = None) -> int:
     output = Path(arguments.output or f"rosbag2_{datetime.now():%Y_%m_%d-%H_%M_%S}")
 
     def make() -> Recorder:
-        choice = chosen(arguments, arguments.include_hidden)
-        if arguments.all:
-            choice = replace(choice, names=frozenset(), pattern=None)
+        choice = Choice(frozenset(arguments.topics), arguments.regex, arguments.exclude)
         _make_room(output, arguments.force)
         return Recorder(BagWriter(output), choice, arguments.duration)
 
