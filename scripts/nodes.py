@@ -7,18 +7,18 @@ Each node is made as its executable makes it, and asked.
 from __future__ import annotations
 
 import inspect
+import math
 import sys
-from array import array
 from collections.abc import Callable
 from typing import Any
 from unittest.mock import Mock
 
 import rclpy
-from rcl_interfaces.msg import ParameterDescriptor
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
 from smp_motor_control import WHEELS
+from smp_motor_control.fields import Described, parameters_in
 from smp_motor_control.nodes import teleop_wheels
 from smp_motor_control.nodes.excite import Excite
 from smp_motor_control.nodes.motor_plant import MotorPlant
@@ -42,8 +42,6 @@ EVERY_NODES = (
     "/rosout",
     "/clock",
     "/tf",  # only where tf2_msgs is installed; the page says so
-    "use_sim_time",
-    "start_type_description_service",
 )
 PARAMETER_SERVICES = ("rcl_interfaces/", "type_description_interfaces/")
 
@@ -105,31 +103,21 @@ def topics(node: Node) -> list[str]:
     ]
 
 
-def limits(descriptor: ParameterDescriptor) -> str:
+def limits(entry: Described) -> str:
     """Return the range of a parameter."""
-    for one in (*descriptor.floating_point_range, *descriptor.integer_range):
-        ends = (float(one.from_value), float(one.to_value))
-        low, high = (f"{end:g}" if abs(end) < 1e300 else "" for end in ends)
-        if low and high:
-            return f"{low} to {high}"
-        return f"at least {low}" if low else f"at most {high}"
-    return ""
+    low, high = (f"{end:g}" if math.isfinite(end) else "" for end in (entry.minimum, entry.maximum))
+    if low and high:
+        return f"{low} to {high}"
+    return f"at least {low}" if low else high and f"at most {high}"
 
 
-def parameters(node: Node) -> list[str]:
+def parameters(settings: type) -> list[str]:
     """Return rows of parameters."""
-    own = {
-        name: parameter.value
-        for name, parameter in node.get_parameters_by_prefix("").items()
-        if name not in EVERY_NODES and not name.startswith(("motors.", "qos_overrides."))
-    }
     rows = ["| parameter | default | range | |", "| --- | --- | --- | --- |"]
-    for name, value in own.items():
-        descriptor = node.describe_parameter(name)
-        fixed = "; fixed at start" if descriptor.read_only else ""
-        text = descriptor.description.rstrip(".") + fixed
-        default = list(value) if isinstance(value, array) else value
-        rows.append(f"| `{name}` | `{default!r}` | {limits(descriptor)} | {text} |")
+    for name, entry in parameters_in(settings).items():
+        text = entry.text.rstrip(".") + ("; fixed at start" if entry.read_only else "")
+        default = list(entry.default) if isinstance(entry.default, tuple) else entry.default
+        rows.append(f"| `{name}` | `{default!r}` | {limits(entry)} | {text} |")
     return rows
 
 
@@ -142,7 +130,15 @@ def section(namespace: str, make: Callable[[], Node]) -> str:
             node.trigger_configure()
         module = sys.modules[type(node).__module__]
         first = str(inspect.getdoc(module)).split("\n")[0]
-        lines = [f"## {node.get_name()}", "", first, "", *topics(node), "", *parameters(node)]
+        lines = [
+            f"## {node.get_name()}",
+            "",
+            first,
+            "",
+            *topics(node),
+            "",
+            *parameters(module.Settings),
+        ]
         node.destroy_node()
         return "\n".join(lines) + "\n"
     finally:

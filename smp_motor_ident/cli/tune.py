@@ -8,7 +8,7 @@ from typing import Any
 from smp_motor_ident.cli import frame
 
 # Names of modules' contents that load only after the arguments are parsed; a test compares them.
-METHODS = ("margin", "pole_placement", "simc", "ziegler_nichols", "tyreus_luyben")
+METHODS = ("margin", "simc", "ziegler_nichols", "tyreus_luyben")
 FORMATS = ("ros2_controllers", "linorobot2", "ros_arduino_bridge", "arduino_pid")
 SPEED_SOURCES = ("measured", "difference", "observer")
 
@@ -39,8 +39,6 @@ AIMS = (
     ("bandwidth", float, "RAD/S", "crossover frequency of the method margin"),
     ("structure", ("pi", "pid"), None, "of the controller; default: the better one"),
     ("closed_loop_time_constant", float, "S", "of the method simc"),
-    ("natural_frequency", float, "RAD/S", "of the method pole_placement; default: the highest"),
-    ("damping", float, "RATIO", "of the method pole_placement; default 0.8"),
     ("max_velocity", float, "RAD/S", "limit of the set-point at the wheel"),
     ("max_acceleration", float, "RAD/S2", "limit of the reference at the wheel"),
     ("transition_time", float, "S", "duration of a change of set-point; default: the shortest"),

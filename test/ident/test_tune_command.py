@@ -78,7 +78,7 @@ def test_a_motor_file_of_identify_is_accepted(tmp_path, capsys):
 def test_comparison_lists_every_method_and_recommends_one(identified, capsys):
     assert main([str(identified), "--compare"]) == 0
     words_shown = capsys.readouterr().out
-    for method in ("margin", "pole_placement", "simc"):
+    for method in ("margin", "simc", "tyreus_luyben"):
         assert f" {method} " in words_shown
     assert "* recommended: " in words_shown
 

@@ -13,7 +13,6 @@ from smp_motor_ident.tune.loop import Loop
 from smp_motor_ident.tune.margins import loop_margins
 from smp_motor_ident.tune.methods import METHODS
 from smp_motor_ident.tune.methods.margin import at_sensitivity
-from smp_motor_ident.tune.methods.pole_placement import place
 from smp_motor_ident.tune.methods.relay import read_oscillation
 from smp_motor_ident.tune.methods.rules import by_rule
 from smp_motor_ident.tune.motors import Motors
@@ -75,15 +74,6 @@ def test_simc_cancels_the_pole_and_closes_the_loop_as_asked():
     )
     assert feedback.p == pytest.approx(0.5 / (2.0 * 0.5))
     assert feedback.p / feedback.i == pytest.approx(0.5)
-
-
-@pytest.mark.parametrize("sample_time", [0.01, 0.001])
-def test_placed_poles_are_poles_of_the_sampled_loop(sample_time):
-    one = problem(PAPER[1], sample_time)
-    feedback = place(one, 20.0, 0.8)
-    wanted = np.exp(sample_time * 20.0 * (-0.8 + 0.6j))
-    poles = np.linalg.eigvals(closed_loop(one.plant, feedback)[0])
-    assert np.abs(poles - wanted).min() < 1e-6  # rounding of the eigenvalue solver
 
 
 def test_ultimate_gain_is_where_proportional_control_turns_unstable():
@@ -282,11 +272,6 @@ def test_bandwidth_beyond_the_delay_is_refused_with_the_nearest(wished):
     nearest = float(words[words.index("is") + 1])
     again = problem(bandwidth=0.999 * nearest)
     assert loop_margins(again.plant, METHODS["margin"].solve(again)).phase >= 59.5
-
-
-def test_natural_frequency_beyond_the_loop_is_refused_with_the_nearest():
-    with pytest.raises(DesignError, match="the nearest design that holds"):
-        METHODS["pole_placement"].solve(problem(natural_frequency=300.0))
 
 
 def test_focus_trades_load_rejection_for_a_flat_response():

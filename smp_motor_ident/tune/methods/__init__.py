@@ -2,8 +2,7 @@
 """Tuning methods, all behind one interface."""
 
 from smp_motor_ident.tune.methods.margin import MARGIN
-from smp_motor_ident.tune.methods.pole_placement import POLE_PLACEMENT
 from smp_motor_ident.tune.methods.rules import SIMC, TYREUS_LUYBEN, ZIEGLER_NICHOLS
 
-_ALL = MARGIN, POLE_PLACEMENT, SIMC, ZIEGLER_NICHOLS, TYREUS_LUYBEN
+_ALL = MARGIN, SIMC, ZIEGLER_NICHOLS, TYREUS_LUYBEN
 METHODS = {method.name: method for method in _ALL}  # every method by its name
