@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Entry points; each handles Ctrl-C from before its imports."""
 
-import importlib.util
+import importlib
 import os
 import signal
 import sys
@@ -18,9 +18,6 @@ _PIP_NAMES = {"yaml": "pyyaml", "numba": "numba==0.61.2"}
 """Distribution names that differ from the module's."""
 
 _ROS_MODULES = ("ament_index_python", "builtin_interfaces", "rcl_interfaces", "rpyutils")
-
-_TOOL_MODULES = ("numpy", "scipy", "numba", "yaml", "rosbags", "msgspec", "rich")
-"""Modules that a tool needs, checked before it starts because some are imported late."""
 
 MAX_DOMAIN_ID = 232  # highest domain whose ports stay below 65536 (DDSI-RTPS 2.5, section 9.6.1.1)
 
@@ -107,22 +104,6 @@ def find_domain_problem() -> str:
     return f"ROS_DOMAIN_ID is {domain!r}; it must be a whole number from 0 to {MAX_DOMAIN_ID}"
 
 
-def _make_tool(name: str, *more: str) -> Callable[[], int]:
-    program = _make_program(f"smp_motor_ident.cli.{name}", 130)
-
-    def run() -> int:
-        for module in (*_TOOL_MODULES, *more):
-            if importlib.util.find_spec(module) is None:
-                print(
-                    f"{name}: {explain_missing_module(ModuleNotFoundError(name=module))}",
-                    file=sys.stderr,
-                )
-                return 2
-        return program()
-
-    return run
-
-
 wheel_pid = node("wheel_pid")
 motor_plant = node("motor_plant")
 skid_steer = node("skid_steer")
@@ -132,8 +113,8 @@ serial_driver = node("serial_driver")
 record = node("record", "smp_motor_ident")
 play = node("play", "smp_motor_ident")
 identifier = node("identifier", "smp_motor_ident")
-identify = _make_tool("identify")
-tune = _make_tool("tune")
-commission = _make_tool("commission", "mcap")
-demo = _make_tool("demo", "mcap")
-lab = _make_tool("lab", "aiohttp", "mcap")
+identify = _make_program("smp_motor_ident.cli.identify", 130)
+tune = _make_program("smp_motor_ident.cli.tune", 130)
+commission = _make_program("smp_motor_ident.cli.commission", 130)
+demo = _make_program("smp_motor_ident.cli.demo", 130)
+lab = _make_program("smp_motor_ident.cli.lab", 130)

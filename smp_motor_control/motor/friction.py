@@ -27,22 +27,15 @@ class Motor:
     ----------
     parameters : MotorParameters
         At the motor shaft.
-    current, speed, angle : float
-        Initial state [A], [rad/s], [rad]; the current follows the voltage where L = 0.
     """
 
-    def __init__(
-        self,
-        parameters: MotorParameters,
-        *,
-        current: float = 0.0,
-        speed: float = 0.0,
-        angle: float = 0.0,
-    ) -> None:
+    current: float  # [A]; it follows the voltage where L = 0
+    speed: float  # [rad/s]
+    angle: float  # [rad]
+
+    def __init__(self, parameters: MotorParameters) -> None:
         self.parameters = parameters
-        self.current = current
-        self.speed = speed
-        self.angle = angle
+        self.current = self.speed = self.angle = 0.0
         self._resistance = parameters.resistance
         self._constant = parameters.motor_constant
         self._inertia = parameters.inertia

@@ -54,7 +54,8 @@ def work(arguments: argparse.Namespace) -> int:
     domain = free_domain() if arguments.domain is None else arguments.domain
     os.environ.update({"ROS_DOMAIN_ID": str(domain), **loopback.loopback_environment()})
     with Processes(folder / "logs") as processes, connect(demo.NAME) as client:
-        robot = start(steps.Robot(processes, client, WHEELS, folder), motors, arguments.rate)
+        robot = steps.Robot(processes, client, WHEELS, folder)
+        start(robot, motors, arguments.rate)
         say(f"running: motor_plant, {len(WHEELS)} wheel_pid, skid_steer (ROS domain {domain})")
         designed = learn(robot, say)
         driven, segments, stall = drive(robot, designed.gains, say)
@@ -88,7 +89,7 @@ def _fresh(folder: Path) -> Path:
     return folder
 
 
-def start(robot: steps.Robot, motors: Path, rate: float) -> steps.Robot:
+def start(robot: steps.Robot, motors: Path, rate: float) -> None:
     """Start the simulated robot and wait until it lives; its controllers stay inactive."""
     processes, client = robot.processes, robot.client
     given = ["--ros-args", "-p", f"motors_file:={motors.resolve()}", "-p", f"rate:={rate}"]
@@ -97,7 +98,6 @@ def start(robot: steps.Robot, motors: Path, rate: float) -> steps.Robot:
     robot.start_controllers(WHEELS)
     client.wait_for_nodes(["motor_plant", "skid_steer"], timeout=steps.TIMEOUT_S)
     client.wait_for_wheels(robot.wheels, timeout=steps.TIMEOUT_S)
-    return robot
 
 
 def learn(robot: steps.Robot, say: Any) -> driving.Designed:

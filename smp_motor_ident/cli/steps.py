@@ -7,7 +7,8 @@ from pathlib import Path
 from typing import Any
 
 from smp_motor_control import controller_of
-from smp_motor_ident.cli import identify, tune
+from smp_motor_ident.bag import writer  # noqa: F401  (that a package is missing is said at once)
+from smp_motor_ident.cli import identify, tables, tune  # noqa: F401
 from smp_motor_ident.cli.processes import ProcessError, Processes
 from smp_motor_ident.report.document import read_identification
 from smp_motor_ident.result import Estimate

@@ -284,10 +284,7 @@ def _compare_with_others(
         usual = float(np.median(others)) if len(others) > 1 else math.nan
         if value > MAX_FRICTION_RATIO * usual:
             text = f"{wheel}: its {what} is {value / usual:.3g} times that of the others: {why}"
-            evidence: dict[str, float | str | None] = {
-                "wheel": wheel, "value": value, "median": usual
-            }  # fmt: skip
-            yield Finding(*code, text, evidence, advice)
+            yield Finding(*code, text, {"wheel": wheel, "value": value, "median": usual}, advice)
 
 
 CHECKS: tuple[Check, ...] = (

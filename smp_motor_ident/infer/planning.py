@@ -41,7 +41,6 @@ class Proposal:
     band: tuple[float, float]  # lowest and highest frequency [Hz] of a Fourier voltage
     duration: float  # [s]
     relative_std: Mapping[str, float]  # that it would leave, as a fraction of the value
-    measure_current: bool  # whether the current must be recorded for it
     words: str  # the advice in one sentence
 
 
@@ -80,7 +79,7 @@ def what_next(
             duration = float(np.clip(length, 5.0, longest))
             after = {n: v * float(np.sqrt(TRIAL_LENGTH / duration)) for n, v in relative.items()}
             words = _words(share * limit, band, duration, needs_current, after, accuracy)
-            made = Proposal(share * limit, band, duration, after, needs_current, words)
+            made = Proposal(share * limit, band, duration, after, words)
             if best is None or _cost(made, accuracy) < _cost(best, accuracy):
                 best = made
     assert best is not None

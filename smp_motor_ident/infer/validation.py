@@ -81,11 +81,6 @@ def _means(time: Array, segment: Integers, angle: Array, lag: int) -> Array:
     return speed
 
 
-def speed_fit(data: Data, simulated: Array, scatter: float = 0.0) -> float:
-    """Return the fit percent of the simulated speed."""
-    return percent(*speeds(data, simulated), scatter)
-
-
 def explained(data: Data, simulated: Array) -> float:
     """Return the fit percent of the speed without its white noise."""
     measured, predicted = speeds(data, simulated)
@@ -100,7 +95,7 @@ def fit_percents(
     group: Sequence[Record], data: Data, found: Fit, kept: Sequence[Record] | None
 ) -> FitPercent:
     """Return the fit of the data, and of records or a last part that were held out."""
-    own = speed_fit(data, found.motion)
+    own = percent(*speeds(data, found.motion))
     held = _held_out(group, data, found, kept)
     return FitPercent(*(float(x) if np.isfinite(x) else None for x in (own, held)))
 
@@ -118,7 +113,7 @@ def _held_out(
     judged = prepare(kept, False)
     if judged.is_angle != data.is_angle or not any(np.ptp(r.voltage) for r in kept):
         return float("nan")
-    return speed_fit(judged, _under_its_load(judged, chain, found.scales))
+    return percent(*speeds(judged, _under_its_load(judged, chain, found.scales)))
 
 
 def _under_its_load(data: Data, chain: Chain, scales: Scales) -> Array:
@@ -154,18 +149,16 @@ def _fit_of_end(group: Sequence[Record], data: Data, found: Fit) -> float:
     return percent(np.where(held, measured, np.nan), simulated, float(np.nanstd(measured)))
 
 
-def cut_of(record: Record, share: float = FITTED_SHARE) -> int:
+def cut_of(record: Record) -> int:
     """Return the row from which a record is held out, its length where it is too short."""
-    cut = int(share * len(record))
+    cut = int(FITTED_SHARE * len(record))
     return len(record) if cut < 2 * MIN_ROWS or len(record) - cut < MIN_ROWS else cut
 
 
-def split(
-    records: Sequence[Record], share: float = FITTED_SHARE
-) -> tuple[list[Record], list[Record]]:
+def split(records: Sequence[Record]) -> tuple[list[Record], list[Record]]:
     """Divide records into a part to fit and a part to hold out."""
     if len(records) >= 3:
-        n = max(1, round((1 - share) * len(records)))
+        n = max(1, round((1 - FITTED_SHARE) * len(records)))
         kept = list(range(1, len(records), max(1, len(records) // n)))[:n]
         return (
             [r for i, r in enumerate(records) if i not in kept],
@@ -173,7 +166,7 @@ def split(
         )
     fitted, kept_records = [], []
     for record in records:
-        cut = cut_of(record, share)
+        cut = cut_of(record)
         fitted.append(record.slice(0, cut))
         if cut < len(record):
             kept_records.append(record.slice(cut, len(record)))

@@ -1,32 +1,20 @@
 # SPDX-License-Identifier: Apache-2.0
 """Check whether the recent samples of a running motor suffice for identification."""
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from smp_motor_control.arrays import Array
-from smp_motor_control.fields import described
 from smp_motor_ident.record import Record
+
+MIN_DURATION_S, MIN_MOTION_S = 5.0, 3.0  # least length of a window, and time of motion in it
+LEVELS, MIN_LEVELS, MIN_CHANGES = 8, 3, 6
+"""Levels that divide the range of voltages, least number of them with 2 % of the samples each, and
+least number of crossings of the mean voltage."""
 
 ROUNDING = 1e-9  # relative rounding error of equal voltages computed in different ways
 
 
-@dataclass(frozen=True)
-class Demands:
-    """Minimum contents of a window for an estimate."""
-
-    duration: float = described(5.0, "Minimum time in the window [s].")
-    moving: float = described(3.0, "Minimum time of motion in the window [s].")
-    bins: int = described(8, "Number of levels that divide the range of voltages.")
-    filled: int = described(3, "Minimum number of levels with 2 % of the samples each.")
-    changes: int = described(6, "Minimum number of crossings of the mean voltage.")
-    both_directions: bool = described(
-        True, "Whether the motor must have turned in both directions."
-    )
-
-
-def missing(record: Record | None, demands: Demands) -> list[str]:
+def missing(record: Record | None) -> list[str]:
     """Return descriptions of missing excitation; empty if an estimate is possible."""
     if record is None:
         return ["no motor_state yet"]
@@ -35,16 +23,16 @@ def missing(record: Record | None, demands: Demands) -> list[str]:
     threshold = 0.02 * max(float(np.nanmax(np.abs(speed))), 1e-9)
     forward, backward = float(np.mean(speed > threshold)), float(np.mean(speed < -threshold))
     moving = (forward + backward) * speed.size * step
-    filled = int(np.sum(_shares(voltage, demands.bins) >= 0.02))
+    filled = int(np.sum(_shares(voltage) >= 0.02))
     above = voltage > voltage.mean()
     changes = int(np.sum(above[1:] != above[:-1]))
     checks: list[tuple[bool, str]] = [
-        (record.duration >= demands.duration, f"{record.duration:.1f} of {demands.duration:g} s"),
-        (moving >= demands.moving, f"turned for {moving:.1f} of {demands.moving:g} s"),
-        (filled >= demands.filled, f"{filled} of {demands.filled} levels of voltage"),
-        (changes >= demands.changes, f"{changes} of {demands.changes} changes of voltage"),
+        (record.duration >= MIN_DURATION_S, f"{record.duration:.1f} of {MIN_DURATION_S:g} s"),
+        (moving >= MIN_MOTION_S, f"turned for {moving:.1f} of {MIN_MOTION_S:g} s"),
+        (filled >= MIN_LEVELS, f"{filled} of {MIN_LEVELS} levels of voltage"),
+        (changes >= MIN_CHANGES, f"{changes} of {MIN_CHANGES} changes of voltage"),
         (
-            not demands.both_directions or min(forward, backward) > 0.1,
+            min(forward, backward) > 0.1,
             f"forward {100 * forward:.0f} %, backward {100 * backward:.0f} % of the time, "
             "10 % each are needed",
         ),
@@ -52,13 +40,13 @@ def missing(record: Record | None, demands: Demands) -> list[str]:
     return [text for met, text in checks if not met]
 
 
-def _shares(voltage: Array, bins: int) -> Array:
+def _shares(voltage: Array) -> Array:
     """Return the shares of the samples in each of the levels of voltage."""
     low, span = voltage.min(), np.ptp(voltage)
     if span <= ROUNDING * np.abs(voltage).max():
         return np.ones(1)
-    level = np.minimum((voltage - low) / span * bins, bins - 1).astype(np.int64)
-    return np.bincount(level, minlength=bins) / voltage.size
+    level = np.minimum((voltage - low) / span * LEVELS, LEVELS - 1).astype(np.int64)
+    return np.bincount(level, minlength=LEVELS) / voltage.size
 
 
 def _speed(record: Record) -> Array:

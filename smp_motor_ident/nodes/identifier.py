@@ -29,14 +29,14 @@ from smp_interfaces.msg import MotorDescription, MotorParameters, MotorState
 from smp_motor_control import WHEELS, check_wheel_names, joint_of
 from smp_motor_control.encoder import wrap
 from smp_motor_control.errors import ParameterError, SmpError
-from smp_motor_control.fields import described, fixed, nested
+from smp_motor_control.fields import described, fixed
 from smp_motor_control.nodes import executor, runtime
 from smp_motor_control.nodes.publishers import PublisherWatch, describe_two_publishers
 from smp_motor_control.nodes.settings import Parameters
 from smp_motor_ident.bag import read
 from smp_motor_ident.bag.window import Window
 from smp_motor_ident.estimate import estimate
-from smp_motor_ident.live.demands import Demands, missing
+from smp_motor_ident.live.demands import MIN_DURATION_S, missing
 from smp_motor_ident.live.monitor import Monitor, commissioned_of
 from smp_motor_ident.record import Record
 from smp_motor_ident.report import document, history
@@ -54,7 +54,9 @@ HISTORY_PERIOD_S = 60.0  # between two lines of a history [s]
 @dataclass(frozen=True, kw_only=True)
 class Settings:
     wheels: tuple[str, ...] = fixed(WHEELS, "Wheels to identify.")
-    window: float = fixed(60.0, "Length of the window of samples [s].", minimum=2.0, maximum=600.0)
+    window: float = fixed(
+        60.0, "Length of the window of samples [s].", minimum=MIN_DURATION_S, maximum=600.0
+    )
     period: float = fixed(
         5.0, "Minimum interval between two estimates of a wheel [s].", minimum=0.5
     )
@@ -72,16 +74,9 @@ class Settings:
     history: str = fixed(
         "", "File to which the history of watched motors is appended; empty: none."
     )
-    demands: Demands = nested(Demands(), prefix="demands.")
 
     def __post_init__(self) -> None:
-        """Refuse wheels that have no topics, and a window that can never meet its demands."""
         check_wheel_names(self.wheels)
-        if self.demands.duration > self.window:
-            raise ParameterError(
-                f"demands.duration is {self.demands.duration:g} s; it must not exceed the "
-                f"window of {self.window:g} s"
-            )
 
 
 class Wheel:
@@ -202,7 +197,7 @@ class Identifier(Node):
             try:
                 self._check_source(wheel)
                 record = wheel.window.record()
-                lacks = missing(record, settings.demands)
+                lacks = missing(record)
             except (SmpError, ArithmeticError, ValueError) as error:
                 record, lacks = None, [str(error)]
             if lacks or record is None:

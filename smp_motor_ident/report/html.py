@@ -79,10 +79,7 @@ def _motor(estimate: Estimate, report: Report) -> dict[str, Any]:
         "messages": shown,
         "other": other,
         "gains": _gains(estimate, report),
-        # By their information criterion, those without one last
-        "candidates": sorted(
-            estimate.candidates, key=lambda c: (not c.chosen, c.bic is None, c.bic or 0.0)
-        ),
+        "candidates": estimate.candidates,
         "charts": [*fit, *residuals, *frequency, *since],
         "history": since,
         "fit": fit,

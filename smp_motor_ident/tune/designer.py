@@ -277,8 +277,7 @@ def _explain(
     if factor < 1:
         words.append(
             f"gains reduced to {100 * factor:.0f} % of the rule's, so that 99 % of these motors "
-            f"keep "
-            "the margins and the control noise stays within the clamp"
+            "keep the margins and the control noise stays within the clamp"
         )
     unmodelled = case.problem.unmodelled
     if unmodelled is not None:

@@ -30,7 +30,6 @@ class WheelSet:
 
     # By wheel; every one has the same duration and limits of its reference
     designs: Mapping[str, Design]
-    one_set: bool  # whether all share their feedback gains
     reason: str  # why one or each, and which motor sets the pace
 
 
@@ -53,11 +52,9 @@ def design_wheels(
     if shared is not None:
         own = {wheel: _with(case, shared) for wheel, case in cases.items()}
     if not together:
-        return WheelSet(
-            own, shared is not None, f"{reason}; each as fast as its own voltage allows"
-        )
+        return WheelSet(own, f"{reason}; each as fast as its own voltage allows")
     common, pace = _together(cases, own)
-    return WheelSet(common, shared is not None, f"{reason}; {pace}")
+    return WheelSet(common, f"{reason}; {pace}")
 
 
 def _with(case: Case, shared: Feedback) -> Design:
@@ -153,12 +150,11 @@ def _choose(
                 "much; ask for one set each, or for smaller margins"
             )
         return None, "one set of gains each: no set keeps the margins on all wheels"
-    if sets == "auto" and best[0] > MAX_REJECTION_LOSS:
+    loss, shared = best
+    if sets == "auto" and loss > MAX_REJECTION_LOSS:
         return None, (
-            f"one set of gains each: with a common set a load would slow a wheel {best[0]:.2f} "
-            f"times "
+            f"one set of gains each: with a common set a load would slow a wheel {loss:.2f} times "
             "as much"
         )
-    return best[
-        1
-    ], f"one set of gains for all: a load slows no wheel by over {100 * (best[0] - 1):.0f} % more"
+    more = 100 * (loss - 1)
+    return shared, f"one set of gains for all: a load slows no wheel by over {more:.0f} % more"

@@ -97,7 +97,8 @@ def test_underdamped_motor_that_dips_below_zero_inside_a_long_step_is_not_missed
         resistance=0.5, inductance=0.5, motor_constant=0.05, inertia=1e-4,
         viscous_friction=0.0, coulomb_friction=1e-4,
     )  # fmt: skip
-    whole, parts = Motor(p, speed=30.0), Motor(p, speed=30.0)
+    whole, parts = Motor(p), Motor(p)
+    whole.speed = parts.speed = 30.0
     whole.step(0.2, 8.0)
     for _ in range(4000):
         parts.step(0.2, 0.002)
@@ -160,7 +161,8 @@ def test_motor_made_of_combinations_answers_a_voltage_like_the_original():
 
 @pytest.mark.parametrize("bad", [(math.nan, 0.01, 0.0), (1.0, -0.01, 0.0), (1.0, 0.01, math.inf)])
 def test_step_with_nonsense_is_refused_and_leaves_the_motor_as_it_was(bad):
-    motor = Motor(paper_motor("front_left"), speed=3.0)
+    motor = Motor(paper_motor("front_left"))
+    motor.speed = 3.0
     with pytest.raises(ParameterError):
         motor.step(*bad)
     assert motor.speed == 3.0

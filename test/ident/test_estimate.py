@@ -173,7 +173,7 @@ def test_outliers_do_not_move_a_robust_fit():
 def test_what_next_asks_for_current_where_there_was_none():
     result = estimate(motors.record("rear_left", current=False))
     proposal = what_next(result, accuracy=0.01)
-    assert proposal.measure_current
+    assert "with the motor current measured" in proposal.words
     assert 0 < proposal.amplitude <= 12
     assert max(proposal.relative_std.values()) <= 0.0101
 

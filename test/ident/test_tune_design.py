@@ -241,7 +241,7 @@ def four(spread: float) -> dict[str, Estimate]:
 def test_alike_motors_share_one_set_of_gains():
     found = four(0.005)
     wheels = design_wheels(found, dict.fromkeys(found, Loop()))
-    assert wheels.one_set
+    assert wheels.reason.startswith("one set of gains for all")
     assert len({(d.gains.p, d.gains.i, d.gains.d) for d in wheels.designs.values()}) == 1
     for one in wheels.designs.values():
         assert one.robustness.holds >= 0.99
@@ -250,7 +250,7 @@ def test_alike_motors_share_one_set_of_gains():
 def test_motors_that_differ_get_gains_of_their_own_and_one_reference():
     found = {f"wheel_{k}": replace(estimate(k), wheel=f"wheel_{k}") for k in range(4)}
     wheels = design_wheels(found, dict.fromkeys(found, Loop()))
-    assert not wheels.one_set
+    assert wheels.reason.startswith("one set of gains each")
     assert len({d.gains.p for d in wheels.designs.values()}) == 4
     plans = [d.reference for d in wheels.designs.values()]
     for name in ("transition_time", "max_velocity", "max_acceleration"):
@@ -260,7 +260,7 @@ def test_motors_that_differ_get_gains_of_their_own_and_one_reference():
 def test_one_set_for_motors_that_differ_holds_for_all_of_them():
     found = {f"wheel_{k}": replace(estimate(k, 0.01), wheel=f"wheel_{k}") for k in range(4)}
     wheels = design_wheels(found, dict.fromkeys(found, Loop()), sets="one")
-    assert wheels.one_set
+    assert wheels.reason.startswith("one set of gains for all")
     for one in wheels.designs.values():
         assert one.robustness.holds >= 0.99
 

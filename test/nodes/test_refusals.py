@@ -12,7 +12,7 @@ REFUSED = [
     ("excite", "-p signal:=noise", "known are sine"),
     ("excite", "-p wheels:=[left] -p wait:=0.2", "no subscriber on /left/motor_command"),
     ("excite", "-p duration:=-1.0", "duration is -1.0"),
-    ("identifier", "-p window:=3.0", "demands.duration"),
+    ("identifier", "-p window:=3.0", "window is 3"),
     ("motor_plant", "-p rate:=fast", "rate is 'fast'"),
     ("motor_plant", "-p motors_file:=/nowhere.yaml", "/nowhere.yaml: cannot be read"),
     ("motor_plant", "--params-file /nowhere.yaml", "/nowhere.yaml"),
