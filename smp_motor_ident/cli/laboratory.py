@@ -71,7 +71,6 @@ def work(arguments: argparse.Namespace) -> int:
             wheels = tuple(arguments.wheel or ()) or commissioning.find_wheels(client)
             robot = steps.Robot(processes, client, wheels or WHEELS, folder, ros, bounds)
             client.wait_for_wheels(robot.wheels, timeout=15.0)
-            client.refuse_second_reporters(robot.wheels)
         served = arguments.host, arguments.port, not arguments.no_browser
         with closing(Laboratory(robot, designs)) as laboratory, Server(laboratory, *served):
             laboratory.run()
