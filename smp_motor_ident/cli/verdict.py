@@ -60,19 +60,15 @@ def show(
     out = console()
     for wheel, estimate in designed.estimates.items():
         title = f"{words.label(wheel)}: {words.model(estimate.model)}"
-        made = table(title, "", "true", "identified", "std", "error/std", "unit")
-        made.columns[5].justify = "left"
+        made = table(title, "", "true", "identified", "error/std")
         compared = _compared(truth[wheel], estimate)
         for name, true, quantity in compared:
-            std = quantity.std or 0.0
-            error = (quantity.value or 0.0) - true
+            std, error = quantity.std or 0.0, (quantity.value or 0.0) - true
             made.add_row(
                 name,
-                words.number(true),
-                words.number(quantity.value, std),
-                words.spread(std) if quantity.status == "estimated" else "given",
+                words.state(Quantity(true, unit=quantity.unit)),
+                words.state(quantity),
                 f"{error / std:+.1f}" if std else "",
-                quantity.unit,
             )
         shares = (f"{n} {words.systematic(q)}" for n, _, q in compared if q.systematic)
         mine = designed.gains[wheel]

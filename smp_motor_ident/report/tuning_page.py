@@ -158,7 +158,7 @@ def page_data(tunings: Mapping[str, Tuning]) -> dict[str, Any]:
 
 def describe(one: Choice) -> dict[str, Any]:
     """Return a choice as the page's script takes it."""
-    asked = {"bandwidth": words.number(one.bandwidth), "margin": f"{one.phase_margin:g}"}
+    asked = {"bandwidth": f"{one.bandwidth:.4g}", "margin": f"{one.phase_margin:g}"}
     if one.design is None or one.curves is None:
         return {**asked, "reason": one.reason}
     found = one.design

@@ -57,20 +57,6 @@ def model(name: str) -> str:
     return MODELS.get(name, name.replace("_", " "))
 
 
-def number(value: float | None, std: float | None = None) -> str:
-    """Return a number with the digits that its standard deviation supports."""
-    if value is None or not math.isfinite(value):
-        return "—"
-    digits = 5
-    if std is not None and std > 0 and value != 0:
-        digits = 2 + math.floor(math.log10(abs(value))) - math.floor(math.log10(std))
-        digits = min(max(digits, 2), 9)
-    if value != 0 and not 1e-3 <= abs(value) < 1e6:
-        return f"{value:.{digits - 1}e}"
-    places = digits - 1 - math.floor(math.log10(abs(value))) if value else 3
-    return f"{value:.{max(places, 0)}f}"
-
-
 def spread(std: float | None) -> str:
     """Return a standard deviation with two digits."""
     if std is None or not math.isfinite(std):

@@ -65,7 +65,7 @@ def assert_page_shows(output: str, *, idle: bool) -> None:
         one, other = numbers(a), numbers(b)
         if "error/std" in a or a.startswith("systematic") or not one:
             continue
-        if re.match(r" [a-z_]+ +[-\d.e]+ +[-\d.e]+ +[-\d.e]+ +[+-]", a):
+        if " ± " in a:
             assert one[0] == other[0], f"{a}: the true motor is {other[0]}"
             assert abs(one[1] - other[1]) < 5 * math.hypot(one[2], other[2]), (a, b)
             # A deviation is an estimate, too: those of R and K differ threefold between runs, and
