@@ -30,7 +30,7 @@ sys.path[:0] = [str(ROOT / "test")]
 
 from browser import Browser  # noqa: E402
 
-from smp_motor_control import WHEELS, controller_of  # noqa: E402
+from smp_motor_control import WHEELS, get_controller_name  # noqa: E402
 from smp_motor_control.motor.file import PAPER_MOTORS, find_config  # noqa: E402
 from smp_motor_control.nodes import loopback  # noqa: E402
 from smp_motor_control.nodes.driving import drive_body  # noqa: E402
@@ -118,7 +118,7 @@ def main() -> int:
             arguments.rate,
         )
         gains = applying.from_file(find_config("gains.yaml"))
-        client.set_parameters({controller_of(w): values for w, values in gains.items()})
+        client.set_parameters({get_controller_name(w): values for w, values in gains.items()})
         robot.switch("activate")
         plan = [("straight", 0.2, 0.0, arguments.seconds)]
         for k in range(2 * arguments.turns):

@@ -15,12 +15,12 @@ WHEELS = ("front_left", "front_right", "rear_left", "rear_right")
 LEFT, RIGHT = WHEELS[::2], WHEELS[1::2]
 
 
-def joint_of(wheel: str) -> str:
+def get_joint_name(wheel: str) -> str:
     """Return the name of a wheel's joint in set-points and joint states."""
     return f"{wheel}_wheel_joint"
 
 
-def controller_of(wheel: str) -> str:
+def get_controller_name(wheel: str) -> str:
     """Return the name of a wheel's controller node, relative to the robot's namespace."""
     return f"{wheel}/wheel_pid"
 

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from xml.etree import ElementTree
 from xml.etree.ElementTree import Element, SubElement
 
-from smp_motor_control import joint_of
+from smp_motor_control import get_joint_name
 
 WIDTH_PER_RADIUS = 0.4  # width of a wheel and height of the box, in wheel radii; for display only
 
@@ -34,7 +34,7 @@ def robot_description(
                 radius=f"{radius:g}",
                 length=f"{WIDTH_PER_RADIUS * radius:g}",
             )
-            joint = SubElement(robot, "joint", name=joint_of(wheel), type="continuous")
+            joint = SubElement(robot, "joint", name=get_joint_name(wheel), type="continuous")
             SubElement(joint, "parent", link="base_link")
             SubElement(joint, "child", link=f"{wheel}_wheel")
             SubElement(joint, "origin", xyz=f"{ahead:g} {side * separation:g} 0")

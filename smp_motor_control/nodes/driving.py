@@ -10,7 +10,7 @@ from rclpy.publisher import Publisher
 from sensor_msgs.msg import JointState
 
 from smp_interfaces.msg import PidState
-from smp_motor_control import joint_of
+from smp_motor_control import get_joint_name
 from smp_motor_control.nodes.robot_client import TIMEOUT_S, RobotClient, RobotError
 from smp_motor_control.nodes.runtime import STREAM_PUBLISHER
 
@@ -46,7 +46,7 @@ def drive_wheels(
     """Drive all wheels through steps of (name, rad/s, s) and stop in any case."""
     _refuse_rivals(client)
     publisher = client.node.create_publisher(JointState, "wheel_setpoints", STREAM_PUBLISHER)
-    message = JointState(name=[joint_of(wheel) for wheel in wheels])
+    message = JointState(name=[get_joint_name(wheel) for wheel in wheels])
 
     def send(speed: float) -> None:
         message.header.stamp = client.node.get_clock().now().to_msg()

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from smp_interfaces.msg import PidState
-from smp_motor_control import controller_of
+from smp_motor_control import get_controller_name
 from smp_motor_control.errors import SmpError
 from smp_motor_control.nodes.robot_client import POLL_PERIOD_S, TIMEOUT_S, RobotClient, RobotError
 from smp_motor_control.nodes.runtime import seconds
@@ -120,7 +120,9 @@ def try_gains(
     """
     watches = {wheel: LoopWatch(supply) for wheel in values}
     with client.listen(PidState, {f"{w}/pid_state": one.take for w, one in watches.items()}):
-        old = client.get_parameters({controller_of(w): list(new) for w, new in values.items()})
+        old = client.get_parameters(
+            {get_controller_name(w): list(new) for w, new in values.items()}
+        )
         client.set_parameters(old)  # ensures that they can be restored
         client.until(lambda: all(w.seen for w in watches.values()), TIMEOUT_S)
         silent = [wheel for wheel, one in watches.items() if not one.seen]
@@ -137,7 +139,7 @@ def try_gains(
         gains = {**pending_restore.get("gains", {}), **old}
         client.set_pending_restore(**{**pending_restore, "gains": gains})
         try:
-            client.set_parameters({controller_of(w): new for w, new in values.items()})
+            client.set_parameters({get_controller_name(w): new for w, new in values.items()})
             begun()
             reason = _watch(client, watches, trial)
         except RobotError as error:

@@ -19,7 +19,7 @@ from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import JointState
 
 from smp_interfaces.msg import MotorDescription, MotorParameters, MotorState, PidState
-from smp_motor_control import controller_of, joint_of
+from smp_motor_control import get_controller_name, get_joint_name
 from smp_motor_control.arrays import Array
 from smp_motor_control.nodes import runtime
 from smp_motor_control.nodes.executor import OwnerReads
@@ -136,12 +136,12 @@ class LiveLink:
         node.create_subscription(DiagnosticArray, "/diagnostics", self._on_diagnostics, 100)
         self._twist = TwistStamped()
         self._twist.header.frame_id = "base_link"
-        self._setpoint = JointState(name=[joint_of(wheel) for wheel in wheels])
+        self._setpoint = JointState(name=[get_joint_name(wheel) for wheel in wheels])
         stream = runtime.STREAM_PUBLISHER
         self.twists = node.create_publisher(TwistStamped, "cmd_vel", stream)
         self._setpoints = node.create_publisher(JointState, "wheel_setpoints", stream)
         self._switches = [
-            node.create_client(ChangeState, f"{controller_of(wheel)}/change_state")
+            node.create_client(ChangeState, f"{get_controller_name(wheel)}/change_state")
             for wheel in wheels
         ]
         runtime.steady_timer(node, FRAME_S, self._on_timer)

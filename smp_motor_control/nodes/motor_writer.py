@@ -11,7 +11,7 @@ from rclpy.node import Node
 from std_msgs.msg import String
 
 from smp_interfaces.msg import MotorCommand, MotorDescription, MotorState
-from smp_motor_control import joint_of
+from smp_motor_control import get_joint_name
 from smp_motor_control.nodes import runtime
 from smp_motor_control.wheel.lease import Lease
 
@@ -85,7 +85,7 @@ class MotorDriver:
         self._clock, self._obey = node.get_clock(), obey
         self.lease = Lease(timeout)
         self.state = MotorState(current=math.nan)
-        self.state.header.frame_id = description.joint_name = joint_of(wheel)
+        self.state.header.frame_id = description.joint_name = get_joint_name(wheel)
         self._owner = "?"
         self._owners = node.create_publisher(String, f"{wheel}/motor_owner", runtime.LATCHED)
         self._states = node.create_publisher(

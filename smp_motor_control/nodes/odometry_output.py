@@ -11,7 +11,7 @@ from rclpy.node import Node
 from rclpy.time import Time
 from sensor_msgs.msg import JointState
 
-from smp_motor_control import joint_of
+from smp_motor_control import get_joint_name
 from smp_motor_control.body.odometry import Odometry
 from smp_motor_control.body.wheel_travel import WheelSample
 from smp_motor_control.nodes.skid_steer_settings import Settings
@@ -80,7 +80,7 @@ class OdometryOutput:
         if not heard:
             return
         message = JointState(
-            name=[joint_of(wheel) for wheel in heard],
+            name=[get_joint_name(wheel) for wheel in heard],
             position=[wheels[wheel].position for wheel in heard],
             velocity=[wheels[wheel].velocity for wheel in heard],
         )

@@ -25,7 +25,7 @@ from rclpy.signals import SignalHandlerOptions
 from std_msgs.msg import String
 
 from smp_interfaces.msg import MotorState
-from smp_motor_control import controller_of
+from smp_motor_control import get_controller_name
 from smp_motor_control.errors import SmpError
 from smp_motor_control.nodes.executor import LeanExecutor
 from smp_motor_control.nodes.guard import Guard
@@ -192,7 +192,7 @@ class RobotClient:
 
     def runs_controller(self, wheel: str) -> bool:
         """Return whether a wheel's ``wheel_pid`` is discovered."""
-        service = self.node.resolve_service_name(f"{controller_of(wheel)}/change_state")
+        service = self.node.resolve_service_name(f"{get_controller_name(wheel)}/change_state")
         return bool(self.node.count_services(service))
 
     def wait_for_nodes(self, nodes: Sequence[str], timeout: float) -> None:
@@ -371,7 +371,7 @@ class RobotClient:
                 for wheel in wheels
                 if "wheel_pid" in self._commanders(wheel) or "/wheel_pid#" in owners.get(wheel, "")
             )
-            nodes = list(map(controller_of, controlled))
+            nodes = list(map(get_controller_name, controlled))
             active = [node for node, state in self.get_states(nodes).items() if state == "active"]
             self.set_pending_restore(active=active)
             self.change_states(active, "deactivate")

@@ -13,7 +13,7 @@ from rclpy.node import Node
 from sensor_msgs.msg import Imu, JointState
 
 from smp_interfaces.msg import MotorState
-from smp_motor_control import joint_of
+from smp_motor_control import get_joint_name
 from smp_motor_control.body.command import BodyCommand, Verdict
 from smp_motor_control.body.odometry import MIN_STEP_S, Odometry
 from smp_motor_control.body.wheel_travel import WheelFeedback, WheelSample
@@ -66,7 +66,7 @@ class SkidSteerNode(Node):
 
     def _connect(self, settings: Settings) -> None:
         wheels = (*self._left, *self._right)
-        self._setpoint = JointState(name=[joint_of(wheel) for wheel in wheels])
+        self._setpoint = JointState(name=[get_joint_name(wheel) for wheel in wheels])
         self._setpoints = self.create_publisher(
             JointState, "wheel_setpoints", runtime.STREAM_PUBLISHER
         )

@@ -20,7 +20,7 @@ from geometry_msgs.msg import Twist, TwistStamped
 from rclpy.node import Node
 from sensor_msgs.msg import JointState
 
-from smp_motor_control import WHEELS, check_wheel_names, joint_of
+from smp_motor_control import WHEELS, check_wheel_names, get_joint_name
 from smp_motor_control.errors import ParameterError, SmpError
 from smp_motor_control.fields import fixed, nested
 from smp_motor_control.keyboard import Keyboard, Speeds, parse_keys
@@ -152,7 +152,7 @@ class TeleopWheels(Node):
         self._twist = TwistStamped() if stamped else Twist()
         if stamped:
             self._twist.header.frame_id = self._settings.frame_id
-        self._setpoint = JointState(name=[joint_of(wheel) for wheel in self._wheels])
+        self._setpoint = JointState(name=[get_joint_name(wheel) for wheel in self._wheels])
         qos = runtime.STREAM_PUBLISHER
         self._twists = self.create_publisher(type(self._twist), "cmd_vel", qos)
         self._setpoints = self.create_publisher(JointState, "wheel_setpoints", qos)

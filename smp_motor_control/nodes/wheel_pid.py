@@ -21,7 +21,7 @@ from sensor_msgs.msg import JointState
 from std_srvs.srv import Trigger
 
 from smp_interfaces.msg import MotorDescription, MotorState, PidState
-from smp_motor_control import joint_of
+from smp_motor_control import get_joint_name
 from smp_motor_control.encoder import Encoder
 from smp_motor_control.errors import ParameterError
 from smp_motor_control.fields import fixed, nested
@@ -59,8 +59,8 @@ class WheelPid(LifecycleNode):
         self._given = Parameters(self, Settings, self._on_change, check=check)
         settings = self._given.settings
         self._robot, _, name = self.get_namespace().rpartition("/")
-        self._joint = settings.joint_name or joint_of(name)
-        if self._joint == joint_of(""):
+        self._joint = settings.joint_name or get_joint_name(name)
+        if self._joint == get_joint_name(""):
             raise ParameterError(
                 "joint_name is empty; set it, or a wheel's namespace: -r __ns:=/front_left"
             )

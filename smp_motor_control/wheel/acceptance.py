@@ -128,7 +128,7 @@ def _check_stop(settings: LoopSettings, speed_per_volt: float, dt: float) -> Non
         raise ParameterError(
             f"the reference cannot be computed with these limits: {error}"
         ) from error
-    lag = settings.reference_delay + settings.reference_doubt
+    lag = settings.reference_delay + settings.reference_delay_uncertainty
     taken, allowed = profile.duration + lag, settings.stop_time
     if taken > allowed + 0.5 * dt:
         times = {
@@ -137,7 +137,7 @@ def _check_stop(settings: LoopSettings, speed_per_volt: float, dt: float) -> Non
             "max_jerk": limits.jerk if math.isfinite(limits.jerk) else 0.0,
             "drive.time_constant": 0.0 if drive is None else drive.time_constant,
             "reference_delay": settings.reference_delay,
-            "reference_doubt": settings.reference_doubt,
+            "reference_delay_uncertainty": settings.reference_delay_uncertainty,
         }
         given = ", ".join(f"{name} {value:g}" for name, value in times.items() if value)
         raise ParameterError(

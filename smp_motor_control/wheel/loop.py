@@ -47,8 +47,8 @@ class LoopSettings:
         0.0, "Lag of the measured speed behind the reference, by delay and averaging [s].",
         minimum=0.0, maximum=10.0,
     )  # fmt: skip
-    # There is no error while the measurement is what the reference was within so much of the delay.
-    reference_doubt: float = described(
+    # The error is zero for every delay within this uncertainty that explains the measurement.
+    reference_delay_uncertainty: float = described(
         0.0, "Uncertainty of that lag [s].", minimum=0.0, maximum=1.0
     )
     # Motor and voltage that changes of set-point keep to, in wheel rad/s; see
@@ -291,8 +291,9 @@ class WheelLoop:
         if settings.reference_delay:
             path = self._path
             now = path.step(setpoint, dt)
-            delay, doubt = settings.reference_delay + self._extra_lag, settings.reference_doubt
-            nominal, compared = path.delayed(delay, doubt, measurement)
+            delay = settings.reference_delay + self._extra_lag
+            uncertainty = settings.reference_delay_uncertainty
+            nominal, compared = path.delayed(delay, uncertainty, measurement)
             acceleration_feedforward = path.acceleration_feedforward(
                 compared, settings.gains, settings.model
             )

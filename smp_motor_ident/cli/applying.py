@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from smp_motor_control import controller_of
+from smp_motor_control import get_controller_name
 from smp_motor_control.parameter_file import read_parameters
 from smp_motor_ident.cli.processes import connect
 from smp_motor_ident.errors import ParameterError
@@ -20,8 +20,10 @@ def apply(wanted: Mapping[str, Mapping[str, Any]], arguments: argparse.Namespace
     with connect("tune", arguments.ros_arguments) as robot:
         from smp_motor_control.nodes.gain_trial import try_gains
 
-        found = robot.get_parameters({controller_of(w): list(new) for w, new in wanted.items()})
-        new = _changes({wheel: found[controller_of(wheel)] for wheel in wanted}, wanted)
+        found = robot.get_parameters(
+            {get_controller_name(w): list(new) for w, new in wanted.items()}
+        )
+        new = _changes({wheel: found[get_controller_name(wheel)] for wheel in wanted}, wanted)
         if not any(new.values()):
             print("the running gains are these already: nothing to set")
             return 0

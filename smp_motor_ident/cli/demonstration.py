@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from smp_motor_control import LEFT, RIGHT, WHEELS, controller_of
+from smp_motor_control import LEFT, RIGHT, WHEELS, get_controller_name
 from smp_motor_control.motor.file import PAPER_MOTORS, find_config, load_motors
 from smp_motor_control.nodes import loopback
 from smp_motor_ident.cli import demo, driving, plan, steps, verdict
@@ -123,7 +123,7 @@ def drive(
     """Drive through :data:`DRIVE` with the gains; return recording, segments and stall [s]."""
     from smp_motor_control.nodes.driving import drive_body
 
-    robot.client.set_parameters({controller_of(w): new for w, new in gains.items()})
+    robot.client.set_parameters({get_controller_name(w): new for w, new in gains.items()})
     robot.switch("activate")
     lasts = plan.format_duration(sum(seconds for *_, seconds in DRIVE))
     say(f"gains set in the running controllers; driving for {lasts}")

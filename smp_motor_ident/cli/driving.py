@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from smp_motor_control import controller_of
+from smp_motor_control import get_controller_name
 from smp_motor_control.arrays import Array
 from smp_motor_control.encoder import unwrap
 from smp_motor_control.motor.parameters import Gearbox
@@ -209,7 +209,7 @@ class Trial:
 @contextlib.contextmanager
 def on_trial(client: Any, gains: Mapping[str, Mapping[str, Any]]) -> Iterator[Trial]:
     """Set gains in the running controllers; restore the old ones unless they are kept."""
-    new = {controller_of(wheel): dict(values) for wheel, values in gains.items()}
+    new = {get_controller_name(wheel): dict(values) for wheel, values in gains.items()}
     old = client.get_parameters({node: list(values) for node, values in new.items()})
     pending_restore, trial = dict(client.pending_restore), Trial()
     client.set_pending_restore(**pending_restore, gains=old)

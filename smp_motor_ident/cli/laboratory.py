@@ -20,7 +20,7 @@ from typing import Any
 
 import numpy as np
 
-from smp_motor_control import WHEELS, check_wheel_names, controller_of
+from smp_motor_control import WHEELS, check_wheel_names, get_controller_name
 from smp_motor_control.arrays import Array
 from smp_motor_control.errors import SmpError
 from smp_motor_control.excitation import SIGNALS
@@ -335,7 +335,7 @@ class Laboratory:
         if "parameters" not in made:
             raise ParameterError(f"{wheel or 'no wheel'} has no design to apply; design one first")
         client, new = self.robot.client, dict(made["parameters"])
-        node = controller_of(wheel)
+        node = get_controller_name(wheel)
         old = client.get_parameters({node: list(new)})[node]
         self._wait(self.link.is_body_idle, moving=True)
         self._activate(True)
@@ -387,7 +387,7 @@ class Laboratory:
             raise ParameterError("no gains are on trial")
         if not keep:
             self.robot.client.set_parameters(
-                {controller_of(wheel): old for wheel, old in self._before.items()}
+                {get_controller_name(wheel): old for wheel, old in self._before.items()}
             )
         done = ", ".join(sorted(self._before))
         self.tell(f"{done}: {'gains kept' if keep else 'old gains restored'}.")
@@ -398,8 +398,8 @@ class Laboratory:
     def _note(self) -> None:
         """Let the guard halt the wheels and restore the old gains if this process dies."""
         pending = {"active": self.robot.client.pending_restore.get("active", ())}
-        pending["halt"] = [controller_of(w) for w in self.robot.wheels if self._taken]
-        pending["gains"] = {controller_of(w): old for w, old in self._before.items()}
+        pending["halt"] = [get_controller_name(w) for w in self.robot.wheels if self._taken]
+        pending["gains"] = {get_controller_name(w): old for w, old in self._before.items()}
         self.robot.client.set_pending_restore(**pending)
 
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from smp_motor_control import controller_of
+from smp_motor_control import get_controller_name
 from smp_motor_ident.bag import writer  # noqa: F401  (that a package is missing is said at once)
 from smp_motor_ident.cli import identify, tables, tune  # noqa: F401
 from smp_motor_ident.cli.processes import ProcessError, Processes
@@ -46,13 +46,13 @@ class Robot:
             place = ["--ros-args", "-r", f"__ns:={space}/{wheel}", "-p", "autostart:=false"]
             given = [*place, *self.ros_arguments]
             self.processes.start(f"{wheel}.wheel_pid", "wheel_pid", *given, priority=1)
-        nodes = [controller_of(wheel) for wheel in wheels]
+        nodes = [get_controller_name(wheel) for wheel in wheels]
         self.client.wait_for_nodes(nodes, TIMEOUT_S)
         self.client.change_states(nodes, "configure")
 
     def switch(self, transition: str) -> None:
         """Apply a lifecycle transition to every wheel's controller."""
-        self.client.change_states([controller_of(wheel) for wheel in self.wheels], transition)
+        self.client.change_states([get_controller_name(wheel) for wheel in self.wheels], transition)
 
 
 TIMEOUT_S = 60.0  # how long a busy machine may take to start or end a process [s]

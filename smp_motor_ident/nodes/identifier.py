@@ -26,7 +26,7 @@ from rclpy.node import Node
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 
 from smp_interfaces.msg import MotorDescription, MotorParameters, MotorState
-from smp_motor_control import WHEELS, check_wheel_names, joint_of
+from smp_motor_control import WHEELS, check_wheel_names, get_joint_name
 from smp_motor_control.encoder import wrap
 from smp_motor_control.errors import ParameterError, SmpError
 from smp_motor_control.fields import described, fixed
@@ -88,7 +88,7 @@ class Wheel:
         self.monitor = monitor
         self._count: int | None = None
         self._position = math.nan
-        self.joint_name = joint_of(name)
+        self.joint_name = get_joint_name(name)
         self.stamp = Time()
         self.status = "collecting: no motor_state yet"
         self.unstamped = False

@@ -39,7 +39,7 @@ def parameters(design: Design) -> dict[str, Any]:
         "max_acceleration": float(limit) if math.isfinite(limit) else 0.0,
         "transition_time": float(reference.transition_time),
         "reference_delay": float(reference.lag),
-        "reference_doubt": float(reference.doubt),
+        "reference_delay_uncertainty": float(reference.doubt),
         "drive": {n: float(x) for n, x in dataclasses.asdict(reference.drive).items()},
         "speed_source": str(design.loop.speed_source),
         "difference_window": _window(design),

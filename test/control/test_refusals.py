@@ -44,7 +44,7 @@ TABLE = [
     (ProfileLimits, {}, "velocity acceleration jerk", (0.0, -1.0, NAN)),
     (LoopSettings, {}, "stop_time", (0.04, 0.0, -1.0, 10.1, INF, NAN)),
     (LoopSettings, {}, "reference_delay", (math.nextafter(10.0, INF), -5e-324, NAN)),
-    (LoopSettings, {}, "reference_doubt", (math.nextafter(1.0, INF), -5e-324, NAN)),
+    (LoopSettings, {}, "reference_delay_uncertainty", (math.nextafter(1.0, INF), -5e-324, NAN)),
     (LoopSettings, {}, "transition_time", (math.nextafter(60.0, INF), -5e-324, NAN)),
     (FaultLimits, {},
      "current_limit current_time stall_voltage stall_velocity stall_time runaway_time "
@@ -78,7 +78,7 @@ def test_an_impossible_number_is_refused_by_its_name(make, others, name, values)
     ("make", "others", "name", "values"),
     [
         (LoopSettings, {}, "reference_delay", (0.0, 10.0)),
-        (LoopSettings, {}, "reference_doubt", (0.0, 1.0)),
+        (LoopSettings, {}, "reference_delay_uncertainty", (0.0, 1.0)),
         (LoopSettings, {}, "transition_time", (0.0, 60.0)),
         (Odometry, AXLE, "travel_noise", (0.0,)),
         (Odometry, AXLE, "turn_noise", (0.0,)),

@@ -22,7 +22,7 @@ KNOWN = OperatingConditions(sample_time=DT, supply=SUPPLY, gearbox=Gearbox(65.5)
 UNHURRIED = {
     "drive": {"drive": Drive(top_speed=3.0, time_constant=1e5)},
     "delay": {"reference_delay": 10.0},
-    "doubt": {"reference_delay": 0.1, "reference_doubt": 1.0},
+    "doubt": {"reference_delay": 0.1, "reference_delay_uncertainty": 1.0},
     "transition": {"transition_time": 60.0},
     "acceleration": {"limits": ProfileLimits(acceleration=0.01)},
     "jerk": {"limits": ProfileLimits(jerk=0.01)},

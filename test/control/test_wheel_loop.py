@@ -189,7 +189,7 @@ def clipped(clip: float, samples: int = 1500) -> tuple[list[float], list[float],
         antiwindup_strategy="back_calculation", tracking_time_constant=4e-3,
     )  # fmt: skip
     settings = LoopSettings(
-        gains=gains, transition_time=0.05, reference_delay=dt, reference_doubt=9e-4,
+        gains=gains, transition_time=0.05, reference_delay=dt, reference_delay_uncertainty=9e-4,
         speed_source="observer", difference_window=4, model=model,
     )  # fmt: skip
     loop = WheelLoop(settings, Gearbox(ratio), Encoder(2000.0), 72.0)

@@ -43,7 +43,7 @@ def settings_of(one) -> LoopSettings:
         ),
         transition_time=plan.transition_time,
         reference_delay=plan.lag,
-        reference_doubt=plan.doubt,
+        reference_delay_uncertainty=plan.doubt,
         drive=replace(plan.drive, top_speed=plan.drive.top_speed / ratio),
         model=MotorModel(**one.motor),
     )
