@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Each component of the catalogue and each stage of the estimator left out in turn.
 
-Every so many records of `frozen`, but the costliest fifth, are estimated with everything and again
-without one thing; of a component those with its effect in middle strength, too, but none without a
-fit with it: there leaving it out takes its share of the random uncertainty (``considered``) and no
-more.  Right ranks before uncertain, that before wrong; of right answers those stated to 5 % first.
+Every so many records of `frozen`, without the costliest fifth, are estimated with everything and
+again without one thing.  For a component, records with its effect in middle strength are added, and
+only records in which it was fitted count.  Right answers rank before uncertain ones, those before
+wrong ones; among right answers those stated to 5 % come first.
 """
 
 from __future__ import annotations
@@ -25,11 +25,11 @@ import smp_motor_ident.estimate as story
 import smp_motor_ident.fit.descend as descend
 import smp_motor_ident.fit.search as search
 import smp_motor_ident.infer.uncertainty as uncertainty
-from smp_motor_ident.chain.catalogue import component_of
+from smp_motor_ident.chain.catalogue import find_component
 
 SHARE = 0.8  # of the records, those that cost least
 Patch = tuple[Any, str, Any]
-simulate, find, guess, noise = chain.simulate, search.search, search.guesses, descend.fit_noise
+simulate, find, guess, noise = chain.simulate, search.search, search.guess_motors, descend.fit_noise
 
 
 def policy(**changes: object) -> list[Patch]:
@@ -38,22 +38,24 @@ def policy(**changes: object) -> list[Patch]:
 
 
 SWITCHES: dict[str, list[Patch]] = {
-    "search": policy(rounds=0, restarts=False),
+    "search": policy(max_rounds=0, restarts=False),
     "restarts with a component": policy(restarts=False),
-    "exchanges": policy(most=-1),
-    "second and third candidate": policy(tried=1),
-    "extra price": policy(extra=0.0),
-    "lag re-attributed": [(search, "relabelled", lambda *_: ())],
-    "size along the signature": [(search, "_rescale", lambda *_: None)],
-    "dropping": [(search, "_drop_needless", lambda found, *_: found)],
-    "second and third guess": [(search, "guesses", lambda data, _, one=None: guess(data, 1, one))],
-    "thinning for the search": [(story, "SEARCH_ROWS", 10**9)],
+    "exchanges": policy(max_exchangeable=-1),
+    "second and third candidate": policy(max_candidates=1),
+    "extra price": policy(extra_price=0.0),
+    "lag re-attributed": [(search, "replace_second_lag", lambda *_: ())],
+    "size along the signature": [(search, "_scale_to_optimum", lambda *_: None)],
+    "dropping": [(search, "_drop_unneeded", lambda found, *_: found)],
+    "second and third guess": [
+        (search, "guess_motors", lambda data, _, one=None: guess(data, 1, one))
+    ],
+    "thinning for the search": [(story, "MIN_SEARCH_ROWS", 10**9)],
     "whitening": [(descend, "fit_noise", lambda rest, runs, _=0: noise(rest, runs, 0))],
     "finer pieces": [(chain, "PIECES_PER_LAG", 2.0)],
-    "trimming to the excitation": [(story, "excitation", lambda record: (0, len(record)))],
-    "adequacy in the intervals": [(uncertainty, "scatters", lambda *_: [])],
-    "considered": [(uncertainty, "considered", lambda *_: [])],
-    "priors in the intervals": [(uncertainty, "of_priors", lambda *_: [])],
+    "trimming to the excitation": [(story, "find_excitation", lambda record: (0, len(record)))],
+    "adequacy in the intervals": [(uncertainty, "compute_scatters", lambda *_: [])],
+    "absent components": [(uncertainty, "assess_absent_components", lambda *_: [])],
+    "priors in the intervals": [(uncertainty, "assess_priors", lambda *_: [])],
 }
 
 
@@ -81,7 +83,7 @@ def identified(job: frozen.Job, patches: list[Patch] | tuple[()] = ()) -> dict[s
 
 def fitted(name: str, row: dict[str, Any]) -> bool:
     """Tell whether something took part in a record; each current sensor always does."""
-    one = component_of(name)
+    one = find_component(name)
     begun = one and {f"fitting {one.title}", f"beginning again with {one.title}"} & set(row["said"])
     current = one in search.CURRENT_SENSORS and row["about"].endswith(" current")
     return not one or bool(begun) or current

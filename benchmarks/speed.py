@@ -34,8 +34,8 @@ from known_motors import ROOT, TABLE_1, recording, table  # noqa: E402
 
 from smp_motor_control.motor.parameters import MotorParameters  # noqa: E402
 from smp_motor_ident.estimate import estimate  # noqa: E402
-from smp_motor_ident.fit.data import SEARCH_ROWS, prepare  # noqa: E402
-from smp_motor_ident.fit.descend import fit, restate  # noqa: E402
+from smp_motor_ident.fit.data import MIN_SEARCH_ROWS, prepare  # noqa: E402
+from smp_motor_ident.fit.descend import evaluate_on_rows, fit  # noqa: E402
 from smp_motor_ident.fit.search import search  # noqa: E402
 from smp_motor_ident.record import Record  # noqa: E402
 
@@ -66,10 +66,10 @@ def shown(motor: MotorParameters, friction: bool) -> np.ndarray:
 def one_fit(record: Record, friction: bool) -> Callable[[], np.ndarray]:
     """Return the fit of all samples that begins at the chain that a part of them shows."""
     data = prepare([record], False)
-    found = search(data.thinned(SEARCH_ROWS))
+    found = search(data.thin(MIN_SEARCH_ROWS))
 
     def call() -> np.ndarray:
-        values = fit(data, restate(data, found)).chain.values
+        values = fit(data, evaluate_on_rows(data, found)).chain.values
         names = ("ln_a0", "ln_a1", "ln_a2", *(("vc",) if friction else ()))
         return np.array([values[n] for n in names])
 

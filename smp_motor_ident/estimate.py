@@ -9,23 +9,23 @@ import numpy as np
 
 from smp_motor_ident.errors import CurrentError, SmpError
 from smp_motor_ident.finding import Finding
-from smp_motor_ident.fit.adequacy import scatters
-from smp_motor_ident.fit.data import SEARCH_ROWS, Data, prepare
-from smp_motor_ident.fit.descend import Fit, constrain, fit, refine, restate
+from smp_motor_ident.fit.adequacy import compute_scatters
+from smp_motor_ident.fit.data import MIN_SEARCH_ROWS, Data, prepare
+from smp_motor_ident.fit.descend import Fit, constrain, evaluate_on_rows, fit, refine
 from smp_motor_ident.fit.search import prune, search
-from smp_motor_ident.infer.answer import answer
-from smp_motor_ident.infer.findings import Judged, findings_of, refuse
-from smp_motor_ident.infer.levels import levels_of
-from smp_motor_ident.infer.provenance import candidates_of, provenance
-from smp_motor_ident.infer.residuals import residual_tests
-from smp_motor_ident.infer.uncertainty import contributions
-from smp_motor_ident.infer.validation import fit_percents
+from smp_motor_ident.infer.answer import state_quantities
+from smp_motor_ident.infer.findings import EstimateContext, collect_findings, refuse_unexplained
+from smp_motor_ident.infer.levels import detect_levels
+from smp_motor_ident.infer.provenance import describe_candidates, describe_provenance
+from smp_motor_ident.infer.residuals import check_residuals
+from smp_motor_ident.infer.uncertainty import collect_contributions
+from smp_motor_ident.infer.validation import compute_fit_percents
 from smp_motor_ident.one_thread import one_thread
-from smp_motor_ident.quality.excitation import excitation
-from smp_motor_ident.quality.repair import repaired
-from smp_motor_ident.quality.screen import screen
+from smp_motor_ident.quality.excitation import find_excitation
+from smp_motor_ident.quality.repair import repair_records
+from smp_motor_ident.quality.screen import screen_records
 from smp_motor_ident.record import Record
-from smp_motor_ident.request import LOSSES, Request, checked
+from smp_motor_ident.request import LOSSES, Request, check_request
 from smp_motor_ident.result import Estimate
 
 
@@ -81,34 +81,34 @@ def estimate(
     docs/derivations.md; Ljung, System Identification, 2nd ed., sections 7.4 and 9.
     """
     group = [records] if isinstance(records, Record) else list(records)
-    request = checked(group, model, fixed, bounds, loss, validation, progress)
-    group = repaired(group)
+    request = check_request(group, model, fixed, bounds, loss, validation, progress)
+    group = repair_records(group)
     with one_thread(), np.errstate(all="ignore"):
         try:
-            return _estimated(group, request, screen(group))
+            return _estimate_group(group, request, screen_records(group))
         except CurrentError as refusal:
             if not request.may_leave_current:
                 raise
             bare, other = request.without_current(group)
-            return _estimated(bare, other, [*screen(bare), _report_left_out(refusal)])
+            return _estimate_group(bare, other, [*screen_records(bare), _report_left_out(refusal)])
 
 
-def _estimated(group: list[Record], request: Request, found: Sequence[Finding]) -> Estimate:
+def _estimate_group(group: list[Record], request: Request, found: Sequence[Finding]) -> Estimate:
     """Search the chain, fit it, and state its numbers with their uncertainty."""
-    group = [r.slice(*excitation(r)) for r in group]
+    group = [r.slice(*find_excitation(r)) for r in group]
     data = prepare(group, request.use_current, LOSSES[request.loss])
-    best = _best_fit(data, request)
-    levels = levels_of(data)
+    best = _fit_best_chain(data, request)
+    levels = detect_levels(data)
     hardware = group[0].hardware
-    parts = contributions(data, best, levels, hardware.timing_accuracy)
-    result = answer(data, best, parts, levels, hardware, request.known)
+    parts = collect_contributions(data, best, levels, hardware.timing_accuracy)
+    result = state_quantities(data, best, parts, levels, hardware, request.known)
     request.say("validating")
-    judged = Judged(
-        group, data, best, parts, scatters(data, best), levels, result,
-        fit_percents(group, data, best, request.validation), residual_tests(data, best),
+    context = EstimateContext(
+        group, data, best, parts, compute_scatters(data, best), levels, result,
+        compute_fit_percents(group, data, best, request.validation), check_residuals(data, best),
         request.known,
     )  # fmt: skip
-    refuse(judged)
+    refuse_unexplained(context)
     return Estimate(
         parameters=result.parameters,
         combinations=result.combinations,
@@ -116,20 +116,20 @@ def _estimated(group: list[Record], request: Request, found: Sequence[Finding]) 
         covariance=result.covariance,
         systematic=result.systematic,
         chain=best.chain.record,
-        fit_percent=judged.percent,
-        residuals=judged.tests,
-        candidates=candidates_of(judged),
-        findings=(*found, *findings_of(judged)),
-        **provenance(judged),
+        fit_percent=context.percent,
+        residuals=context.tests,
+        candidates=describe_candidates(context),
+        findings=(*found, *collect_findings(context)),
+        **describe_provenance(context),
     )
 
 
-def _best_fit(data: Data, request: Request) -> Fit:
+def _fit_best_chain(data: Data, request: Request) -> Fit:
     """Return the fit of the chain that explains the data at the lowest price."""
-    thin = data.thinned(SEARCH_ROWS)
+    thin = data.thin(MIN_SEARCH_ROWS)
     found = search(thin, request.policy, request.say)
     request.say(f"fitting {' + '.join(found.chain.codes)}")
-    found = fit(data, found if thin is data else restate(data, found))
+    found = fit(data, found if thin is data else evaluate_on_rows(data, found))
     found = prune(data, refine(data, found))
     return constrain(data, found, request.constraints) if request.constraints else found
 

@@ -42,7 +42,7 @@ class Request:
         if self.window > 0 and not {"averaging_window", "sensor_lag"} & set(given):
             given["averaging_window"] = self.window
         return SelectionPolicy(
-            rounds=0 if forced else SelectionPolicy.rounds,
+            max_rounds=0 if forced else SelectionPolicy.max_rounds,
             restarts=not forced,
             first_order=self.model == "first_order",
             given=given,
@@ -53,11 +53,11 @@ class Request:
         """Return the known values and limits of the motor's quantities."""
         exact = {n: (v, v) for n, v in self.known.items() if n in PHYSICAL}
         if not self.use_current:
-            exact = {n: (v, v) for n, v in self._of_ohmmeter()}
+            exact = {n: (v, v) for n, v in self._list_separating_quantities()}
         limits = {**self.bounds, **exact}
         return tuple(Constraint(n, low, high) for n, (low, high) in limits.items())
 
-    def _of_ohmmeter(self) -> Iterator[tuple[str, float]]:
+    def _list_separating_quantities(self) -> Iterator[tuple[str, float]]:
         """Yield the quantities that separate the parameters without a current."""
         resistance, inductance, constant = (
             self.known.get(n) for n in ("resistance", "inductance", "motor_constant")
@@ -75,10 +75,10 @@ class Request:
     def without_current(self, group: Sequence[Record]) -> tuple[list[Record], Request]:
         """Return the records without their current, and the request for them."""
         bare = [replace(r, current=None) for r in group]
-        return bare, replace(self, known=_with_ohmmeter(self.known, bare), use_current=False)
+        return bare, replace(self, known=_add_ohmmeter(self.known, bare), use_current=False)
 
 
-def checked(
+def check_request(
     group: Sequence[Record],
     model: str,
     fixed: Mapping[str, float] | None,
@@ -87,7 +87,7 @@ def checked(
     validation: Sequence[Record] | None,
     progress: Callable[[str], None] | None,
 ) -> Request:
-    """Return the validated request."""
+    """Check the arguments of `estimate` and return them."""
     if not group:
         raise ParameterError("estimate needs at least one record")
     if model not in ("auto", *MODELS):
@@ -110,12 +110,12 @@ def checked(
     if model == "electromechanical" and not use_current:
         raise ParameterError("model 'electromechanical' needs a recorded current")
     return Request(
-        model, _with_ohmmeter(known, group), bounds or {}, loss, validation,
+        model, _add_ohmmeter(known, group), bounds or {}, loss, validation,
         progress or (lambda _: None), use_current, max(r.velocity_window for r in group),
     )  # fmt: skip
 
 
-def _with_ohmmeter(known: Mapping[str, float], group: Sequence[Record]) -> dict[str, float]:
+def _add_ohmmeter(known: Mapping[str, float], group: Sequence[Record]) -> dict[str, float]:
     ohmmeter = group[0].hardware.resistance
     if "resistance" not in known and ohmmeter and np.isfinite(ohmmeter) and not has_current(group):
         return {**known, "resistance": float(ohmmeter)}
@@ -151,7 +151,7 @@ def _check_bounds(
 
 
 def has_current(group: Sequence[Record]) -> bool:
-    """Tell whether a current was measured, often enough to tell something."""
+    """Tell whether a current was measured in enough samples."""
     there = [r.current for r in group if r.current is not None]
     finite = sum(int(np.isfinite(c).sum()) for c in there)
     enough = finite > CURRENT_THERE * sum(len(r) for r in group)

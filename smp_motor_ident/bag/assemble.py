@@ -14,7 +14,7 @@ from smp_motor_ident.bag.axis import Motor, Series, resample_to_output, select_f
 from smp_motor_ident.bag.storage import Table
 from smp_motor_ident.errors import BagError
 from smp_motor_ident.limits import MAX_COUNT_STEP, MAX_STRAY_ROW_SHARE
-from smp_motor_ident.quality.stamps import find_beat, moves_on
+from smp_motor_ident.quality.stamps import find_beat, is_on_beat
 from smp_motor_ident.record import Hardware, Record
 
 _OUTPUTS = ("count", "position", "velocity")
@@ -84,7 +84,7 @@ def _fit_arrivals(motor: Motor, topic: str, time: Integers) -> Integers:
         if clock.measure_rhythm(time).regular or signal is None or signal.topic != topic:
             return time
         motion = table.columns[signal.field].astype(np.float64)
-        if not moves_on(beat, time, motion):
+        if not is_on_beat(beat, time, motion):
             return time
     text = (
         f"{topic or 'time'}: arrival times fitted to their period of {beat.period * 1e-6:.5g} ms "

@@ -14,7 +14,7 @@ from smp_motor_ident.limits import (
     MAX_LATE_COMMAND_RESIDUAL,
     MAX_SHIFTED_RESIDUAL_RATIO,
 )
-from smp_motor_ident.quality.lag import lagged
+from smp_motor_ident.quality.lag import apply_lag
 
 LAGS, OWN = 6, 2
 MAX_DELAY_ROWS = 200  # largest delay of a command behind its motion that is searched [rows]
@@ -96,7 +96,7 @@ def find_late_rows(u: Array, y: Array) -> int:
     shifts = np.arange(-most, most + 1)
     lags = np.geomspace(0.5, y.size / 20, 12)
     shares = np.array(
-        [_explained_shares_by_shift(lagged(u - u[0], float(lag)), y, shifts) for lag in lags]
+        [_explained_shares_by_shift(apply_lag(u - u[0], float(lag)), y, shifts) for lag in lags]
     )
     rest = 1 - shares.max(axis=0)
     about = int(shifts[np.argmin(rest)])
@@ -140,8 +140,8 @@ def _residual_share(u: Array, y: Array, shift: int, lag: float) -> float:
     some = y[::every]
     best = np.inf
     for trial, second in product(lag * np.geomspace(0.4, 2.5, 25), SECOND_LAG_ROWS):
-        columns = (lagged(u, trial), lagged(np.sign(y), trial), np.ones(y.size))
-        columns = (lagged(columns[0], second), *columns[1:])
+        columns = (apply_lag(u, trial), apply_lag(np.sign(y), trial), np.ones(y.size))
+        columns = (apply_lag(columns[0], second), *columns[1:])
         matrix = np.stack(columns)[:, ::every]
         both = matrix @ some
         multiples = np.linalg.lstsq(matrix @ matrix.T, both, rcond=None)[0]
@@ -152,7 +152,7 @@ def _residual_share(u: Array, y: Array, shift: int, lag: float) -> float:
 def find_lagged_share(u: Array, y: Array) -> float:
     """Return the share of a signal explained by a lag of another; 0 if another shift is better."""
     lags = np.geomspace(1.0, max(y.size / 20, 2.0), 8)
-    share = max(_explained_share(lagged(u - u[0], float(lag)), y) for lag in lags)
+    share = max(_explained_share(apply_lag(u - u[0], float(lag)), y) for lag in lags)
     return share if share > max(HALF_EXPLAINED, _explained_share(u, y)) else 0.0
 
 

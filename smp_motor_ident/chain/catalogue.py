@@ -39,12 +39,12 @@ ALL: tuple[Component, ...] = (
 )  # fmt: skip
 
 
-def chain_from(record: ChainRecord) -> Chain:
+def rebuild_chain(record: ChainRecord) -> Chain:
     """Return the chain that plain data describe."""
-    components = tuple(one for code in record.components if (one := component_of(code)))
+    components = tuple(one for code in record.components if (one := find_component(code)))
     return Chain(components, dict(record.values))
 
 
-def component_of(code: str) -> Component | None:
+def find_component(code: str) -> Component | None:
     """Return the component of a code."""
     return next((one for one in ALL if one.code == code), None)

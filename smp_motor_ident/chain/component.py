@@ -15,7 +15,7 @@ from smp_motor_ident.finding import Severity
 from smp_motor_ident.simulate.motion import Motion
 from smp_motor_ident.simulate.rows import Rows
 
-LEAST_LAG = 0.005  # second lag over the first from which it may be that of another component
+MIN_SECOND_LAG_SHARE = 0.005  # of the first lag, that another component may replace
 
 Values = Mapping[str, Array]
 """Parameters by their names, each for every lane."""
@@ -75,11 +75,11 @@ class Component:
     prior: ClassVar[float] = 0.1  # probability of its presence in a recording
     rank: ClassVar[int] = 0  # place among the components that shape a command, the lowest first
     linear: ClassVar[str] = ""  # parameter that its effect is proportional to
-    alters: ClassVar[bool] = False  # whether it changes much: not found from a fit without it
+    needs_own_start: ClassVar[bool] = False  # whether no fit without it leads to it
     lag: ClassVar[str] = ""  # parameter of its delay, if it can replace a lag
     lateness: ClassVar[float] = 1.0  # delay [s] of a size of that parameter of 1
 
-    def expected(self, scales: Scales) -> Sequence[tuple[Mapping[str, float], float, float]]:
+    def list_priors(self, scales: Scales) -> Sequence[tuple[Mapping[str, float], float, float]]:
         """Return prior knowledge: weights of a sum of parameters, its mean and its deviation."""
         return ()
 
@@ -100,17 +100,17 @@ class Component:
         """Return where a fit with this component begins in a chain of some values."""
         return self.starts(scales)
 
-    def relabelled(self, values: Mapping[str, float]) -> Mapping[str, float]:
+    def replace_second_lag(self, values: Mapping[str, float]) -> Mapping[str, float]:
         """Return values of a chain in which this component replaces most of the second lag.
 
-        A component that the chain already has takes up the lag, too.
+        A component that the chain already has absorbs the lag, too.
         """
         if not self.lag or "ln_a2" not in values:
             return {}
         first = math.exp(values["ln_a1"] - values["ln_a0"])
         product = math.exp(values["ln_a2"] - values["ln_a0"])
         second = 0.5 * (first - math.sqrt(max(first**2 - 4 * product, 0.0)))
-        if second < LEAST_LAG * first or second > 0.9 * first:
+        if second < MIN_SECOND_LAG_SHARE * first or second > 0.9 * first:
             return {}
         rest = max(first - second, 0.1 * first)
         ln_a1 = values["ln_a0"] + math.log(rest)

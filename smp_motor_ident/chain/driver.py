@@ -14,7 +14,7 @@ from smp_motor_ident.simulate import lanes as at
 from smp_motor_ident.simulate.rows import Rows
 
 
-def _sizes(name: str, *sizes: float) -> list[dict[str, float]]:
+def _scale_sizes(name: str, *sizes: float) -> list[dict[str, float]]:
     return [{name: size} for size in sizes]
 
 
@@ -33,7 +33,7 @@ class DeadZone(Component):
 
     def starts(self, scales: Scales) -> Sequence[Mapping[str, float]]:
         """Return small and large dead zones."""
-        return _sizes("dead_zone", *(x * scales.volts for x in (0.02, 0.1)))
+        return _scale_sizes("dead_zone", *(x * scales.volts for x in (0.02, 0.1)))
 
 
 class HardDeadZone(Component):
@@ -47,17 +47,17 @@ class HardDeadZone(Component):
     severity = "warning"
     advice = "lower the least command of the firmware, or keep commands above it"
     parameters = (Parameter("least_command", "V", 0.0, 0.6, typical=0.1, threshold=True),)
-    EDGE = 0.02
+    EDGE_SHARE = 0.02
     """Share of the largest command over which it sets in, so that it has a derivative."""
 
     def shape_command(self, p: Values, command: Array, rows: Rows, scales: Scales) -> Array:
         """Return the command where it is large enough."""
-        beyond = (np.abs(command) - p["least_command"]) / (self.EDGE * scales.volts)
+        beyond = (np.abs(command) - p["least_command"]) / (self.EDGE_SHARE * scales.volts)
         return command * np.clip(beyond + 0.5, 0.0, 1.0)
 
     def starts(self, scales: Scales) -> Sequence[Mapping[str, float]]:
         """Return sizes so close that every level of a command falls between two."""
-        return _sizes("least_command", *(0.03 * k * scales.volts for k in range(1, 17)))
+        return _scale_sizes("least_command", *(0.03 * k * scales.volts for k in range(1, 17)))
 
 
 class Clip(Component):
@@ -68,7 +68,7 @@ class Clip(Component):
     advice = "keep commands below the supply, or record the voltage at the terminals"
     rank = 2
     linear = "clip_voltage"
-    alters = True
+    needs_own_start = True
     parameters = (Parameter("clip_voltage", "V", 0.05, 1.0, neutral=1.0, typical=0.1),)
 
     def shape_command(self, p: Values, command: Array, rows: Rows, scales: Scales) -> Array:
@@ -77,7 +77,7 @@ class Clip(Component):
 
     def starts(self, scales: Scales) -> Sequence[Mapping[str, float]]:
         """Return limits below the largest command."""
-        return _sizes("clip_voltage", *(x * scales.volts for x in (0.95, 0.85, 0.7, 0.5)))
+        return _scale_sizes("clip_voltage", *(x * scales.volts for x in (0.95, 0.85, 0.7, 0.5)))
 
 
 class WeakSide(Component):
@@ -96,7 +96,7 @@ class WeakSide(Component):
 
     def starts(self, scales: Scales) -> Sequence[Mapping[str, float]]:
         """Return a weakness of either side."""
-        return _sizes("weak_side", 0.03)
+        return _scale_sizes("weak_side", 0.03)
 
 
 class Slew(Component):
@@ -107,7 +107,7 @@ class Slew(Component):
     advice = "raise or switch off the ramp of the driver"
     rank = 3
     linear = "ramp_time"
-    alters = True
+    needs_own_start = True
     lag, lateness = "ramp_time", 0.5
     parameters = (Parameter("ramp_time", "s", 0.0, 20.0, typical=0.3),)
 
@@ -121,11 +121,11 @@ class Slew(Component):
         length = np.maximum(ends - begin, 0.0)
         rate = scales.volts / np.maximum(p["ramp_time"], 1e-12)
         shaped = np.broadcast_to(command, (command.shape[0], rate.size))
-        return _ramp(np.ascontiguousarray(shaped), length, rows.section, rate)
+        return _limit_slew(np.ascontiguousarray(shaped), length, rows.section, rate)
 
     def starts(self, scales: Scales) -> Sequence[Mapping[str, float]]:
         """Return ramps around the motor's own lag."""
-        return _sizes("ramp_time", *(x * scales.lag for x in (0.2, 0.6, 1.5, 4.0)))
+        return _scale_sizes("ramp_time", *(x * scales.lag for x in (0.2, 0.6, 1.5, 4.0)))
 
 
 class Sag(Component):
@@ -143,7 +143,7 @@ class Sag(Component):
 
     def starts(self, scales: Scales) -> Sequence[Mapping[str, float]]:
         """Return good and poor supplies."""
-        return _sizes("source_resistance_ratio", 0.05, 0.3)
+        return _scale_sizes("source_resistance_ratio", 0.05, 0.3)
 
 
 class Drop(Component):
@@ -161,7 +161,7 @@ class Drop(Component):
 
     def starts(self, scales: Scales) -> Sequence[Mapping[str, float]]:
         """Return small and large drops."""
-        return _sizes("brush_drop", *(x * scales.volts for x in (0.02, 0.1)))
+        return _scale_sizes("brush_drop", *(x * scales.volts for x in (0.02, 0.1)))
 
 
 class CurrentLimit(Component):
@@ -171,7 +171,7 @@ class CurrentLimit(Component):
     severity = "warning"
     advice = "raise the current limit of the driver, or excite with smaller steps"
     linear = "current_limit_voltage"
-    alters = True
+    needs_own_start = True
     parameters = (Parameter("current_limit_voltage", "V", 0.02, 2.0, neutral=2.0, typical=0.5),)
 
     def write(self, p: Values, lanes: Array) -> None:
@@ -180,7 +180,7 @@ class CurrentLimit(Component):
 
     def starts(self, scales: Scales) -> Sequence[Mapping[str, float]]:
         """Return limits that reversals, and such that steps reach."""
-        return _sizes("current_limit_voltage", *(x * scales.volts for x in (1.5, 0.8, 0.4)))
+        return _scale_sizes("current_limit_voltage", *(x * scales.volts for x in (1.5, 0.8, 0.4)))
 
 
 class FastDecay(Component):
@@ -192,7 +192,7 @@ class FastDecay(Component):
         "let the driver brake between its pulses (slow decay), or record the voltage at the "
         "terminals"
     )
-    alters = True
+    needs_own_start = True
     parameters = (Parameter("fast_decay_ratio", "1", 0.02, 300.0),)
 
     def write(self, p: Values, lanes: Array) -> None:
@@ -201,7 +201,7 @@ class FastDecay(Component):
 
     def starts(self, scales: Scales) -> Sequence[Mapping[str, float]]:
         """Return slow and fast PWM."""
-        return _sizes("fast_decay_ratio", 0.1, 0.5, 2.0, 10.0)
+        return _scale_sizes("fast_decay_ratio", 0.1, 0.5, 2.0, 10.0)
 
 
 class FreeAtZero(Component):
@@ -219,7 +219,7 @@ class FreeAtZero(Component):
 
     def starts(self, scales: Scales) -> Sequence[Mapping[str, float]]:
         """Return an open bridge."""
-        return _sizes("coasting_share", 0.9)
+        return _scale_sizes("coasting_share", 0.9)
 
 
 class Decline(Component):
@@ -237,11 +237,11 @@ class Decline(Component):
 
     def starts(self, scales: Scales) -> Sequence[Mapping[str, float]]:
         """Return a slight decline."""
-        return _sizes("decline", 0.03)
+        return _scale_sizes("decline", 0.03)
 
 
 @compiled
-def _ramp(command: Array, length: Array, section: Integers, rate: Array) -> Array:
+def _limit_slew(command: Array, length: Array, section: Integers, rate: Array) -> Array:
     out = np.empty(command.shape)
     for g in range(section.shape[0] - 1):
         for b in range(command.shape[1]):

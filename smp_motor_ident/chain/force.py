@@ -96,7 +96,7 @@ class LoadStep(Component):
     severity = "warning"
     advice = "look for what brakes the motor from then on"
     linear = "load_step"
-    alters = True
+    needs_own_start = True
     parameters = (
         Parameter("load_step", "V", -1.0, 1.0, typical=0.05),
         Parameter("load_step_at", "1", 0.0, 1.0),

@@ -14,7 +14,7 @@ from smp_motor_ident.chain.component import Component, Parameter, Scales, Values
 from smp_motor_ident.simulate import lanes as at
 
 
-def _gain(scales: Scales) -> tuple[Mapping[str, float], float, float]:
+def _expect_gain(scales: Scales) -> tuple[Mapping[str, float], float, float]:
     return {"ln_a0": 1.0}, math.log(scales.volts / scales.speed), 1.5
 
 
@@ -24,9 +24,9 @@ class FirstOrder(Component):
     code, slot, title = "first_order", "motor", "first order"
     parameters = (Parameter("ln_a0", "ln"), Parameter("ln_a1", "ln"))
 
-    def expected(self, scales: Scales) -> Sequence[tuple[Mapping[str, float], float, float]]:
+    def list_priors(self, scales: Scales) -> Sequence[tuple[Mapping[str, float], float, float]]:
         """Return that the largest command reaches about the largest speed."""
-        return (_gain(scales),)
+        return (_expect_gain(scales),)
 
     def write(self, p: Values, lanes: Array) -> None:
         """Put ``a1 w' + a0 w = v - F``."""
@@ -59,10 +59,10 @@ class SecondOrder(Component):
         lanes[at.TM], lanes[at.TE] = tm, a2 / tm
         lanes[at.K], lanes[at.BE] = a0 - be, be
 
-    def expected(self, scales: Scales) -> Sequence[tuple[Mapping[str, float], float, float]]:
+    def list_priors(self, scales: Scales) -> Sequence[tuple[Mapping[str, float], float, float]]:
         """Return values of small motors: L/R of 0.003 to 0.15 time constants, some damping."""
         lag = {"ln_a2": 1.0, "ln_a1": -2.0, "ln_a0": 1.0}
-        return _gain(scales), (lag, math.log(0.02), 1.5), ({"viscous": 1.0}, 0.12, 0.12)
+        return _expect_gain(scales), (lag, math.log(0.02), 1.5), ({"viscous": 1.0}, 0.12, 0.12)
 
 
 class Electromechanical(SecondOrder):
@@ -84,7 +84,7 @@ class Friction(Component):
         """Put friction in both directions."""
         lanes[at.VC_PLUS] = lanes[at.VC_MINUS] = p["vc"]
 
-    def expected(self, scales: Scales) -> Sequence[tuple[Mapping[str, float], float, float]]:
+    def list_priors(self, scales: Scales) -> Sequence[tuple[Mapping[str, float], float, float]]:
         """Return values of geared motors."""
         return (({"vc": 1.0}, 0.05 * scales.volts, 0.15 * scales.volts),)
 
@@ -97,7 +97,7 @@ class Load(Component):
     """A constant load [V]."""
 
     code, slot, title = "load", "load", "constant load"
-    alters = True
+    needs_own_start = True
     linear = "load"
     prior = 0.3
     parameters = (Parameter("load", "V", -1.0, 1.0, typical=0.02),)

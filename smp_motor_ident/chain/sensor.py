@@ -62,7 +62,7 @@ class MeanSpeed(Sensor):
 
     code, slot, title = "averaged_speed", "speed sensor", "averaged speed"
     lag, lateness = "window", 0.5
-    alters = True
+    needs_own_start = True
     parameters = (Parameter("window", "row", 0.0, 200.0, typical=2.0),)
 
     def sense(self, p: Values, motion: Motion, rows: Rows, scales: Scales) -> Array:
@@ -78,11 +78,11 @@ class DifferencedSpeed(MeanSpeed):
     """A speed that is the difference of counts from row to row, which its steps show."""
 
     code, title = "differenced_speed", "speed differenced from row to row"
-    alters = False
+    needs_own_start = False
     lag = ""
     prior = 0.9
 
-    def expected(self, scales: Scales) -> Sequence[tuple[Mapping[str, float], float, float]]:
+    def list_priors(self, scales: Scales) -> Sequence[tuple[Mapping[str, float], float, float]]:
         """Return a window of one row."""
         return (({"window": 1.0}, scales.sample, 0.05 * scales.sample),)
 
@@ -92,7 +92,7 @@ class LowPassedSpeed(Sensor):
 
     code, slot, title = "low_passed_speed", "speed sensor", "low-passed speed"
     lag = "sensor_lag"
-    alters = True
+    needs_own_start = True
     parameters = (Parameter("sensor_lag", "s", 0.0, 20.0, typical=0.2),)
 
     def sense(self, p: Values, motion: Motion, rows: Rows, scales: Scales) -> Array:

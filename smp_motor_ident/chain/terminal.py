@@ -53,7 +53,7 @@ class Driver:
         return float(self.lane[at.CURRENT_LIMIT])
 
 
-def driver_of(chain: Chain, largest: float, supply: float) -> Driver:
+def make_driver(chain: Chain, largest: float, supply: float) -> Driver:
     """Return the driver of a chain that was identified with commands up to ``largest`` [V]."""
     values = chain.values
     lane = chain.lanes({n: np.array([v]) for n, v in values.items()}, 1)[:, 0].copy()
@@ -71,13 +71,13 @@ def driver_of(chain: Chain, largest: float, supply: float) -> Driver:
     return Driver(numbers, lane)
 
 
-def no_driver() -> Driver:
+def make_ideal_driver() -> Driver:
     """Return a driver that puts out its command."""
     return Driver(np.array([0.0, np.inf, np.inf, 0.0, 1.0, 1.0, 0.0]), at.NEUTRAL.copy())
 
 
 @compiled
-def put_out(
+def apply_driver(
     numbers: Array, lane: Array, command: float, back_emf: float, before: float, interval: float
 ) -> tuple[float, float]:
     """Return the mean voltage at the terminals over an interval, and the command at its end [V].

@@ -25,7 +25,7 @@ from smp_motor_ident.bag.read import read_experiments
 from smp_motor_ident.cli.workers import end_with_parent
 from smp_motor_ident.errors import BagError, ParameterError, SmpError
 from smp_motor_ident.estimate import estimate
-from smp_motor_ident.quality.excitation import excerpts
+from smp_motor_ident.quality.excitation import select_excerpts
 from smp_motor_ident.report import fleet, words
 from smp_motor_ident.report.document import check_free, write_together
 from smp_motor_ident.result import plain
@@ -95,7 +95,7 @@ def identify_one(path: str, settings: tuple[Any, ...]) -> list[fleet.Row]:
             dates = [one.recorded for one in records if one.recorded is not None]
             about: dict[str, Any] = dict(wheel=wheel, date=min(dates, default=None))
             try:
-                found = estimate(excerpts(records), model, fixed=fixed)
+                found = estimate(select_excerpts(records), model, fixed=fixed)
             except SmpError as error:
                 rows.append(_row(path, **about, failure=str(error)))
                 continue

@@ -25,8 +25,8 @@ from smp_motor_ident.compilation import load
 from smp_motor_ident.errors import BagError, InsufficientExcitationError, ParameterError, SmpError
 from smp_motor_ident.estimate import estimate
 from smp_motor_ident.infer.planning import what_next
-from smp_motor_ident.infer.validation import simulate, split
-from smp_motor_ident.quality.excitation import excerpts
+from smp_motor_ident.infer.validation import simulate, split_holdout
+from smp_motor_ident.quality.excitation import select_excerpts
 from smp_motor_ident.record import Record
 from smp_motor_ident.report import figures, history, summary, words
 from smp_motor_ident.report.document import (
@@ -164,7 +164,7 @@ def identify_wheel(
     say: Callable[[str], None],
 ) -> Outcome:
     """Estimate one motor; a refusal is an outcome too, with its reason."""
-    records, kept = excerpts(records), excerpts(kept)
+    records, kept = select_excerpts(records), select_excerpts(kept)
     try:
         found = estimate(records, model, fixed=fixed, validation=list(kept) or None, progress=say)
     except ParameterError:
@@ -179,7 +179,7 @@ def identify_wheel(
         )
         return Outcome(failure=InsufficientExcitationError(text))
     judged = found.fit_percent.validation is not None
-    fitted, held_out = (records, kept) if kept or not judged else split(records)
+    fitted, held_out = (records, kept) if kept or not judged else split_holdout(records)
     parts: dict[figures.Role, Sequence[Record]] = {"estimation": fitted, "validation": held_out}
     compared = [
         figures.Comparison(role, one.source, one.time, one.voltage, *simulate(found, one))

@@ -22,10 +22,10 @@ import numpy as np
 from smp_motor_control.arrays import Array, Integers
 from smp_motor_ident.fit.data import Data
 from smp_motor_ident.fit.descend import Fit
-from smp_motor_ident.fit.start import command_of
+from smp_motor_ident.fit.start import average_command
 
-BLOCKS = 24
-SIGNIFICANT = 2.0  # standard deviations by which a scatter exceeds chance
+BLOCK_COUNT = 24
+MIN_SIGNIFICANT_EXCESS = 2.0  # standard deviations of a scatter beyond chance
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,19 +38,19 @@ class Scatter:
     excess: Array  # shape (p, p): covariance of the parameters beyond chance
 
 
-def scatters(data: Data, found: Fit) -> list[Scatter]:
+def compute_scatters(data: Data, found: Fit) -> list[Scatter]:
     """Return the scatter of the score over every partition."""
-    made = (scatter(found, name, label) for name, label in partitions(data, found))
+    made = (compute_scatter(found, name, label) for name, label in partition_rows(data, found))
     return [one for one in made if one is not None]
 
 
-def partitions(data: Data, found: Fit) -> Iterator[tuple[str, Integers]]:
+def partition_rows(data: Data, found: Fit) -> Iterator[tuple[str, Integers]]:
     """Yield labels of rows that have independent scores if the chain is right.
 
     They follow the simulated motion, as the measured one shares its noise with the residual.
     """
     n = len(data)
-    yield "autocorrelation", np.arange(n) * BLOCKS // n
+    yield "autocorrelation", np.arange(n) * BLOCK_COUNT // n
     motion = found.motion
     if data.is_angle:
         motion = np.diff(motion, prepend=np.nan) / np.where(
@@ -62,12 +62,12 @@ def partitions(data: Data, found: Fit) -> Iterator[tuple[str, Integers]]:
     yield "speed", (2 * level + (speed > 0)).astype(np.int64)
     quick = np.abs(np.diff(speed, prepend=speed[0]))
     level = np.searchsorted(np.quantile(quick, [0.2, 0.4, 0.6, 0.8]), quick)
-    command = np.abs(command_of(data.rows))
+    command = np.abs(average_command(data.rows))
     high = command > np.median(command)
     yield "acceleration", (2 * level + high).astype(np.int64)
 
 
-def scatter(found: Fit, name: str, label: Integers) -> Scatter | None:
+def compute_scatter(found: Fit, name: str, label: Integers) -> Scatter | None:
     """Return the scatter between labelled parts."""
     linear = found.linear
     m, p = linear.row.size, linear.columns.shape[1]
@@ -99,13 +99,13 @@ def scatter(found: Fit, name: str, label: Integers) -> Scatter | None:
         spread += excess
     if dof == 0:
         return None
-    values, vectors = np.linalg.eigh(_symmetric(inverse @ spread @ inverse))
+    values, vectors = np.linalg.eigh(_make_symmetric(inverse @ spread @ inverse))
     excess = (vectors * np.maximum(values, 0.0)) @ vectors.T
     # Stretches of time also scatter by effects outside all regimes, such as late commands.
-    least = 0.0 if name == "autocorrelation" else SIGNIFICANT
+    least = 0.0 if name == "autocorrelation" else MIN_SIGNIFICANT_EXCESS
     significant = (statistic - dof) / math.sqrt(2 * dof) > least
     return Scatter(name, statistic / dof, significant, excess)
 
 
-def _symmetric(a: Array) -> Array:
+def _make_symmetric(a: Array) -> Array:
     return np.asarray(0.5 * (a + a.T))

@@ -12,21 +12,21 @@ import numpy as np
 
 from smp_motor_control.arrays import Array, Flags, Integers
 from smp_motor_ident.chain.component import Scales
-from smp_motor_ident.fit.noise import runs_of
+from smp_motor_ident.fit.noise import find_runs
 from smp_motor_ident.quality.resolution import (
-    FINEST_ENCODER,
-    FINEST_SENSOR,
-    angle_of,
-    repeats,
+    MIN_ENCODER_STEP,
+    MIN_SENSOR_STEP_SHARE,
+    mark_repeats,
+    select_angle,
     speed_quantum,
 )
-from smp_motor_ident.quality.standstill import stands
+from smp_motor_ident.quality.standstill import detect_rest_at_start
 from smp_motor_ident.record import Record
 from smp_motor_ident.simulate.rows import Rows
 
-SEARCH_ROWS = 4000  # rows on which the chain is sought; it is fitted to all
-ALIKE = 0.01
-"""Share of the largest command by which commands of one row may differ where rows are left out."""
+MIN_SEARCH_ROWS = 4000  # of the search; the chain is then fitted to all rows
+MAX_MERGED_COMMAND_DIFFERENCE = 0.01
+"""Difference of commands, over the largest, up to which thinning merges them."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,7 +39,7 @@ class Data:
     quantum: float  # resolution of ``motion``, 0 where it has none
     current: Array | None  # shape (n,), [A]; NaN where lost
     initial: Array  # shape (segments, 4): first guess of q, speed, angle, and 0
-    stood: Flags  # shape (segments,): whether it begins at standstill
+    starts_at_rest: Flags  # shape (segments,): whether it begins at standstill
     full_duty: float
     sample: float  # interval between rows as recorded [s]
     huber: float = np.inf  # bound of a robust loss, in standard deviations
@@ -81,12 +81,12 @@ class Data:
     @cached_property
     def runs(self) -> tuple[Integers, ...]:
         """Runs of measured rows without a gap: first and end, as places in `known`."""
-        return tuple(runs_of(rows, self.rows.segment, 1) for rows in self.known)
+        return tuple(find_runs(rows, self.rows.segment, 1) for rows in self.known)
 
     @cached_property
     def whole_runs(self) -> tuple[Integers, ...]:
         """Runs of measured rows, across gaps."""
-        return tuple(runs_of(rows, self.rows.segment, len(self)) for rows in self.known)
+        return tuple(find_runs(rows, self.rows.segment, len(self)) for rows in self.known)
 
     @cached_property
     def volts(self) -> float:
@@ -104,20 +104,20 @@ class Data:
             speed[at[1:]] = np.diff(self.motion[at]) / np.diff(self.rows.time[at])
         return speed
 
-    def thinned(self, most: int) -> Data:
-        """Return every so many rows, less than twice ``most`` in all; the command stays whole."""
-        every = len(self) // most
+    def thin(self, min_rows: int) -> Data:
+        """Keep ``min_rows`` to twice as many rows, evenly spaced, and the whole command."""
+        every = len(self) // min_rows
         if every <= 1:
             return self
         rows = self.rows
         kept = [
-            a + _spread(np.isfinite(self.motion[a:b]), every) for a, b in pairwise(rows.segment)
+            a + _thin_rows(np.isfinite(self.motion[a:b]), every) for a, b in pairwise(rows.segment)
         ]
         index = np.concatenate(kept)
         segment = np.concatenate([[0], np.cumsum([k.size for k in kept])])
         # Sections of about equal command within a row are one, of their mean.
         same = np.zeros(rows.command.size, dtype=np.bool_)
-        same[1:] = np.abs(np.diff(rows.command)) <= ALIKE * self.volts
+        same[1:] = np.abs(np.diff(rows.command)) <= MAX_MERGED_COMMAND_DIFFERENCE * self.volts
         same[rows.section[:-1]] = False
         same &= ~np.isin(rows.begin, rows.time[index])
         at = np.flatnonzero(~same)
@@ -142,8 +142,8 @@ class Data:
         )  # fmt: skip
 
 
-def _spread(known: Flags, every: int) -> Integers:
-    """Return one row of every so many, the first that is known if any is."""
+def _thin_rows(known: Flags, every: int) -> Integers:
+    """Return one row of each ``every``, the first measured one if there is any."""
     row = np.arange(0, known.size, every)
     padded = np.zeros(row.size * every, dtype=np.bool_)
     padded[: known.size] = known
@@ -153,8 +153,8 @@ def _spread(known: Flags, every: int) -> Integers:
 
 
 def prepare(records: Sequence[Record], use_current: bool, huber: float = np.inf) -> Data:
-    """Put records one after the other; segments keep a state of their own."""
-    angles = [angle_of(r) for r in records]
+    """Concatenate records; each segment keeps its own initial state."""
+    angles = [select_angle(r) for r in records]
     is_angle = all(one is not None for one in angles)
     rng = np.random.default_rng(0)
     motions, quantum = [], 0.0
@@ -164,7 +164,7 @@ def prepare(records: Sequence[Record], use_current: bool, huber: float = np.inf)
             motion, quantum = angle
             if quantum > 0 and np.isfinite(motion).all():
                 count = np.rint(motion / quantum).astype(np.int64)
-                motion = np.where(repeats(count, record.starts), np.nan, motion)
+                motion = np.where(mark_repeats(count, record.starts), np.nan, motion)
         else:
             assert record.velocity is not None
             motion, quantum = record.velocity, speed_quantum(record.velocity)
@@ -175,21 +175,23 @@ def prepare(records: Sequence[Record], use_current: bool, huber: float = np.inf)
     time = np.concatenate([r.time for r in records])
     voltage = np.concatenate([r.voltage for r in records])
     motion = np.concatenate(motions)
-    stood = stands(time, motion, voltage, segment, is_angle, quantum)
+    at_rest = detect_rest_at_start(time, motion, voltage, segment, is_angle, quantum)
     begun = voltage.copy()
-    begun[segment[:-1][stood]] = 0.0
+    begun[segment[:-1][at_rest]] = 0.0
     current = None
     if use_current:
         every = [np.full(len(r), np.nan) if r.current is None else r.current for r in records]
         current = np.concatenate([dither(i, False, rng) for i in every])
-    initial = _initial(time, motion, segment, is_angle)
-    initial[stood, 1] = 0.0
+    initial = _guess_initial_states(time, motion, segment, is_angle)
+    initial[at_rest, 1] = 0.0
     supply = max(r.hardware.supply_voltage or 0.0 for r in records)
     rows = Rows.held(time, begun, segment)
-    return Data(rows, motion, is_angle, quantum, current, initial, stood, supply, rows.step, huber)
+    return Data(
+        rows, motion, is_angle, quantum, current, initial, at_rest, supply, rows.step, huber
+    )
 
 
-def _initial(time: Array, motion: Array, segment: Integers, is_angle: bool) -> Array:
+def _guess_initial_states(time: Array, motion: Array, segment: Integers, is_angle: bool) -> Array:
     """Return a first guess of q, speed, angle and load at the beginning of every segment."""
     initial = np.zeros((segment.size - 1, 4))
     for g, (a, b) in enumerate(pairwise(segment)):
@@ -208,11 +210,11 @@ def _initial(time: Array, motion: Array, segment: Integers, is_angle: bool) -> A
 
 
 def dither(values: Array, is_angle: bool, rng: np.random.Generator) -> Array:
-    """Return a signal as the finest sensor of it reads.
+    """Add the rounding of the finest real sensor to a signal.
 
     A simulator's noise-free signal would otherwise have unbounded weight relative to the others.
     """
     known = values[np.isfinite(values)]
     extent = float(np.ptp(known)) if known.size else 0.0
-    step = FINEST_ENCODER if is_angle else FINEST_SENSOR * extent
+    step = MIN_ENCODER_STEP if is_angle else MIN_SENSOR_STEP_SHARE * extent
     return np.asarray(values + step * rng.uniform(-0.5, 0.5, values.size))

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Weighted least squares of a chain on data, from given values: Levenberg-Marquardt.
 
-Derivatives are kept while steps gain what they promise, so that most steps simulate one motor.
+Derivatives are reused while steps gain as predicted, so that most steps simulate one motor.
 Derivation: docs/derivations.md, section 6.
 """
 
@@ -20,25 +20,25 @@ from smp_motor_ident.chain.component import Scales
 from smp_motor_ident.fit.data import Data
 from smp_motor_ident.fit.linear import (
     Linear,
-    follow,
+    build_prior_rows,
+    compute_residual,
     invert,
     linearise,
-    prior_rows,
-    residual,
-    settled,
+    reuse_derivatives,
+    update_initial_states,
     whiten,
 )
 from smp_motor_ident.fit.noise import MAX_ORDER, Noise, fit_noise
 
-FARTHEST = 1.5  # e-folds that a logarithm moves in one step
+MAX_LOG_STEP = 1.5  # of a logarithm
 MAX_STEPS = 30
-CONVERGED = 1e-2  # of the deviance: a tenth of a standard deviation
-MOST_DAMPING = 100.0
-NEAR = 0.03  # share of the cost that a step may promise where derivatives are kept
-NEAR_FOLD = 0.2  # step of a logarithm up to which they are
-KEPT = 0.5  # share of its promise that the gain of a step may be off where they are kept
-ROUGHNESS = 3.0  # times what is converged that events and rounding make the cost uneven
-FRESH = 0.1  # e-folds from where derivatives were taken up to which they serve at the end
+DEVIANCE_TOLERANCE = 1e-2  # a tenth of a standard deviation
+MAX_DAMPING = 100.0
+MAX_REUSE_COST_SHARE = 0.03  # predicted gain over cost up to which derivatives are reused
+MAX_REUSE_LOG_STEP = 0.2  # step of a logarithm up to which they are
+MAX_REUSE_GAIN_ERROR = 0.5  # relative error of the predicted gain up to which they are
+COST_ROUGHNESS = 3.0  # tolerances by which events and rounding make the cost uneven
+MAX_DERIVATIVE_DISTANCE = 0.1  # of a logarithm, from derivatives that a fit returns
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,9 +53,9 @@ class Fit:
     deviance: float  # -2 log likelihood, up to a constant of the data
 
     @cached_property
-    def priors(self) -> tuple[str, ...]:
+    def prior_causes(self) -> tuple[str, ...]:
         """Causes of the last rows of ``linear``."""
-        return prior_rows(self.chain, self.scales)[2]
+        return build_prior_rows(self.chain, self.scales)[2]
 
     @property
     def motion(self) -> Array:
@@ -72,7 +72,7 @@ class Fit:
         """Covariance of the estimated parameters under their noise model, shape (p, p)."""
         return invert(self.linear.normal)
 
-    def under(self, data: Data, noise: Sequence[Noise]) -> Fit:
+    def with_noise(self, data: Data, noise: Sequence[Noise]) -> Fit:
         """Return the fit at the same values under another noise model."""
         old = self.linear
         linear = whiten(
@@ -80,78 +80,79 @@ class Fit:
             old.exact,
         )  # fmt: skip
         return replace(
-            self, noise=tuple(noise), linear=linear, deviance=_deviance(data, linear, noise)
+            self, noise=tuple(noise), linear=linear, deviance=_compute_deviance(data, linear, noise)
         )
 
-    def descended(self, data: Data, converged: float = CONVERGED, most: int = MAX_STEPS) -> Fit:
+    def descend(
+        self, data: Data, tolerance: float = DEVIANCE_TOLERANCE, max_steps: int = MAX_STEPS
+    ) -> Fit:
         """Return the fit at the nearest minimum, see `descend`."""
-        return descend(
-            data, self.chain, self.scales, self.initial, self.noise, most, converged, self.linear
-        )
+        start = self.chain, self.scales, self.initial, self.noise
+        return descend(data, *start, max_steps, tolerance, self.linear)
 
     def residual(self, data: Data, chain: Chain) -> Array | None:
         """Return the whitened residual of another chain, None if not finite; shape (m,)."""
-        return residual(data, chain, self.scales, self.initial, self.noise, self.linear)
+        return compute_residual(data, chain, self.scales, self.initial, self.noise, self.linear)
 
 
 def descend(
     data: Data, chain: Chain, scales: Scales, initial: Array, noise: Sequence[Noise],
-    most: int = MAX_STEPS, converged: float = CONVERGED, linear: Linear | None = None,
+    max_steps: int = MAX_STEPS, tolerance: float = DEVIANCE_TOLERANCE, linear: Linear | None = None,
 ) -> Fit:  # fmt: skip
     """Return the chain at the nearest minimum of the whitened sum of squares.
 
-    It ends where a step changes the deviance by no more than ``converged``.  ``linear``: residuals
+    It ends where a step changes the deviance by no more than ``tolerance``.  ``linear``: residuals
     at these values, and derivatives from values nearby.
     """
     at, start = chain, initial.copy()
     if linear is None:
         linear = linearise(data, at, scales, start, noise)
     if not at.free:
-        start = settled(start, linear, np.zeros(0))
+        start = update_initial_states(start, linear, np.zeros(0))
         linear = linearise(data, at, scales, start, noise)
-    moved, damping = 0.0, 1e-4  # e-folds since derivatives were taken
-    for _ in range(most if at.free else 0):
-        step = _step(linear, at, scales, damping)
+    moved, damping = 0.0, 1e-4  # of a logarithm since derivatives were taken
+    for _ in range(max_steps if at.free else 0):
+        step = _compute_step(linear, at, scales, damping)
         if not np.isfinite(step).all():
             break
         trial = at.with_values(_apply_step(at, scales, step))
         taken = np.array([trial.values[p.name] - at.values[p.name] for p in at.free])
         expected = float(taken @ (2 * linear.gradient - linear.normal @ taken))
-        fold = _longest_fold(at, taken)
-        place = data, trial, scales, settled(start, linear, taken), noise
-        near = 0 <= expected < NEAR * linear.cost and fold < NEAR_FOLD
+        fold = _find_longest_log_step(at, taken)
+        place = data, trial, scales, update_initial_states(start, linear, taken), noise
+        near = 0 <= expected < MAX_REUSE_COST_SHARE * linear.cost and fold < MAX_REUSE_LOG_STEP
         following = _simulate_step(place, linear, near)
         gained = linear.cost - following.cost
-        least = converged * min(linear.cost / linear.row.size, 1.0)
+        least = tolerance * min(linear.cost / linear.row.size, 1.0)
         if _is_lower(following, linear):
             at, start, linear = trial, place[3], following
             moved = 0.0 if linear.exact else moved + fold
             damping = max(damping / 10, 1e-12)
             if expected < least and gained < least:
                 break
-            if linear.exact or abs(gained - expected) < KEPT * expected:
+            if linear.exact or abs(gained - expected) < MAX_REUSE_GAIN_ERROR * expected:
                 continue
         elif linear.exact:
             damping = max(damping * 10, 1e-2)
             # A step that a bound cut short may promise a loss; a shorter one does not.
-            if damping > MOST_DAMPING or 0 <= expected < ROUGHNESS * least:
+            if damping > MAX_DAMPING or 0 <= expected < COST_ROUGHNESS * least:
                 break
             continue
         elif expected < least:
             break
         linear, moved = linearise(data, at, scales, start, noise), 0.0
-    if moved > FRESH:
+    if moved > MAX_DERIVATIVE_DISTANCE:
         linear = linearise(data, at, scales, start, noise)
-    return Fit(at, scales, start, tuple(noise), linear, _deviance(data, linear, noise))
+    return Fit(at, scales, start, tuple(noise), linear, _compute_deviance(data, linear, noise))
 
 
 def _simulate_step(
     place: tuple[Data, Chain, Scales, Array, Sequence[Noise]], linear: Linear, near: bool
 ) -> Linear:
-    """Return residuals after a step, with derivatives of their own where those kept do not do."""
+    """Return residuals after a step, with new derivatives where reused ones do not suffice."""
     data, chain = place[:2]
     if near and not chain.constraints and not np.isfinite(data.huber):
-        following = follow(*place, linear)
+        following = reuse_derivatives(*place, linear)
         if _is_lower(following, linear):
             return following
     return linearise(*place)
@@ -162,13 +163,13 @@ def _is_lower(one: Linear, other: Linear) -> bool:
     return one.cost <= (1 + 1e-9) * other.cost
 
 
-def _deviance(data: Data, linear: Linear, noise: Sequence[Noise]) -> float:
+def _compute_deviance(data: Data, linear: Linear, noise: Sequence[Noise]) -> float:
     return linear.cost + sum(
         its.log_determinant(runs) for its, runs in zip(noise, data.runs, strict=True)
     )
 
 
-def _step(linear: Linear, chain: Chain, scales: Scales, damping: float) -> Array:
+def _compute_step(linear: Linear, chain: Chain, scales: Scales, damping: float) -> Array:
     """Return the damped Gauss-Newton step; parameters pushed against a bound stay."""
     gradient, normal = linear.gradient, linear.normal
     scale = np.sqrt(np.maximum(np.diag(normal), 1e-300))
@@ -191,11 +192,11 @@ def _step(linear: Linear, chain: Chain, scales: Scales, damping: float) -> Array
                 pushed = True
         if not pushed:
             break
-    longest = _longest_fold(chain, step)
-    return step * (FARTHEST / longest) if longest > FARTHEST else step
+    longest = _find_longest_log_step(chain, step)
+    return step * (MAX_LOG_STEP / longest) if longest > MAX_LOG_STEP else step
 
 
-def _longest_fold(chain: Chain, step: Array) -> float:
+def _find_longest_log_step(chain: Chain, step: Array) -> float:
     """Return the longest step of a logarithm."""
     every = zip(step, chain.free, strict=True)
     return max((abs(float(s)) for s, p in every if p.unit == "ln"), default=0.0)
@@ -211,28 +212,33 @@ def _apply_step(chain: Chain, scales: Scales, step: Array) -> dict[str, float]:
 
 
 def approach(
-    data: Data, chain: Chain, scales: Scales, initial: Array, most: int = MAX_ORDER
+    data: Data, chain: Chain, scales: Scales, initial: Array, max_order: int = MAX_ORDER
 ) -> Fit:
-    """Return the fit from values that are far off, under the noise of its residual.
+    """Return the fit from distant values, under the noise of its residual.
 
-    A misfit tells no noise: it is white at first, or of the speed for an angle, which drifts.
+    A misfit does not show the noise: it is white at first, of the speed where an angle is recorded.
     """
     noise = [Noise.white(float(np.nanstd(y)) or 1.0) for y in data.outputs]
     if data.is_angle:
         noise[0] = Noise.integrated(float(np.nanstd(data.speed)) * data.rows.step or 1.0)
-    found = descend(data, chain, scales, initial, noise, most=20, converged=1.0)
-    return found.under(data, fit_noises(data, found.linear, most))
+    found = descend(data, chain, scales, initial, noise, max_steps=20, tolerance=1.0)
+    return found.with_noise(data, fit_noises(data, found.linear, max_order))
 
 
 def fit(
-    data: Data, begun: Fit, rounds: int = 6, most: int = MAX_ORDER, converged: float = CONVERGED
+    data: Data,
+    begun: Fit,
+    rounds: int = 6,
+    max_order: int = MAX_ORDER,
+    tolerance: float = DEVIANCE_TOLERANCE,
 ) -> Fit:
-    """Return the chain and the noise of every output that explain data best, from a fit."""
-    found = begun.descended(data, 1.0, 8)
-    least = max(10 * converged, 1.0)
+    """Alternate between fitting the chain and the noise of every output."""
+    found = begun.descend(data, 1.0, 8)
+    least = max(10 * tolerance, 1.0)
     for _ in range(rounds):
-        other = found.under(data, fit_noises(data, found.linear, most)).descended(data, converged)
-        gained = _information_criterion(data, found) - _information_criterion(data, other)
+        noise = fit_noises(data, found.linear, max_order)
+        other = found.with_noise(data, noise).descend(data, tolerance)
+        gained = _compute_bic(data, found) - _compute_bic(data, other)
         if gained > 0:
             found = other
         if gained < least:
@@ -241,27 +247,27 @@ def fit(
 
 
 def refine(data: Data, found: Fit) -> Fit:
-    """Return a fit, or that which begins at it under white noise, where it is better.
+    """Return a fit, or a better one that begins at it under white noise.
 
-    Coloured noise takes up a misfit of the motion, and keeps it.
+    Coloured noise absorbs a misfit of the motion, and hides it.
     """
     if found.noise[0].order == 0:
         return found
     white = (Noise.white(float(np.nanstd(data.motion - found.motion))), *found.noise[1:])
-    begun = found.under(data, white).descended(data)
-    other = fit(data, begun.under(data, fit_noises(data, begun.linear)))
-    return min(found, other, key=lambda f: _information_criterion(data, f))
+    begun = found.with_noise(data, white).descend(data)
+    other = fit(data, begun.with_noise(data, fit_noises(data, begun.linear)))
+    return min(found, other, key=lambda f: _compute_bic(data, f))
 
 
-def _information_criterion(data: Data, found: Fit) -> float:
+def _compute_bic(data: Data, found: Fit) -> float:
     counts = zip(found.noise, data.known, strict=True)
     return found.deviance + sum(n.order * math.log(max(k.size, 2)) for n, k in counts)
 
 
 def constrain(data: Data, found: Fit, constraints: Sequence[Constraint]) -> Fit:
-    """Return the fit under constraints, which are tightened step by step.
+    """Return the fit under constraints, tightened step by step.
 
-    A tight one has a narrow valley, along which a descent from afar gets nowhere.
+    A tight constraint makes a narrow valley, in which a descent from afar is slow.
     """
     for deviation in (0.3, 0.03, 3e-3, 3e-4, 1e-6):
         held = tuple(replace(c, deviation=deviation) for c in constraints)
@@ -270,19 +276,19 @@ def constrain(data: Data, found: Fit, constraints: Sequence[Constraint]) -> Fit:
     return fit(data, found)
 
 
-def restate(data: Data, found: Fit) -> Fit:
-    """Return a fit at the same values on other rows of its recording."""
+def evaluate_on_rows(data: Data, found: Fit) -> Fit:
+    """Evaluate a fit on other rows of its recording, at the same values."""
     chain, scales = found.chain, found.scales
     white = tuple(Noise.white(float(np.nanstd(y)) or 1.0) for y in data.outputs)
     linear = linearise(data, chain, scales, data.initial, white)
-    initial = settled(data.initial, linear, np.zeros(len(chain.free)))
-    linear = follow(data, chain, scales, initial, white, linear)
+    initial = update_initial_states(data.initial, linear, np.zeros(len(chain.free)))
+    linear = reuse_derivatives(data, chain, scales, initial, white, linear)
     begun = replace(found, initial=initial, noise=white, linear=linear)
-    return begun.under(data, fit_noises(data, linear))
+    return begun.with_noise(data, fit_noises(data, linear))
 
 
-def settle(data: Data, chain: Chain, scales: Scales) -> Array:
-    """Return the motion simulated freely, only the initial states fitted."""
+def simulate_freely(data: Data, chain: Chain, scales: Scales) -> Array:
+    """Simulate the motion freely from fitted initial states."""
     chain = chain.without_slot("current sensor")
     fixed = replace(chain, fixed=frozenset(p.name for p in chain.parameters), constraints=())
     motion = replace(data, current=None)
@@ -290,11 +296,11 @@ def settle(data: Data, chain: Chain, scales: Scales) -> Array:
     initial = data.initial
     for _ in range(4):
         linear = linearise(motion, fixed, scales, initial, noise)
-        initial = settled(initial, linear, np.zeros(0))
+        initial = update_initial_states(initial, linear, np.zeros(0))
     return linearise(motion, fixed, scales, initial, noise).simulated[0]
 
 
-def fit_noises(data: Data, linear: Linear, most: int = MAX_ORDER) -> list[Noise]:
+def fit_noises(data: Data, linear: Linear, max_order: int = MAX_ORDER) -> list[Noise]:
     """Return the noise of every output by its residual."""
     every = zip(data.outputs, linear.simulated, data.known, data.runs, strict=True)
-    return [fit_noise((y - x)[known], runs, most) for y, x, known, runs in every]
+    return [fit_noise((y - x)[known], runs, max_order) for y, x, known, runs in every]

@@ -20,7 +20,7 @@ from smp_motor_ident.chain.quantities import jacobian
 from smp_motor_ident.fit.data import Data
 from smp_motor_ident.fit.noise import Noise
 
-PRIOR_STATE = 2.0  # of q and speed at the beginning of a segment, in the largest of the recording
+INITIAL_STATE_PRIOR_STD = 2.0  # of q and speed, relative to the largest of the recording
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,7 +56,7 @@ class Linear:
 
 
 def invert(normal: Array) -> Array:
-    """Return the inverse of a normal matrix; without information the variance is very large."""
+    """Invert a normal matrix; directions without information get a very large variance."""
     scale = np.sqrt(np.maximum(np.diag(normal), 1e-300))
     values, vectors = np.linalg.eigh(normal / np.outer(scale, scale))
     inverse = (vectors / np.maximum(values, 1e-13)) @ vectors.T
@@ -70,7 +70,7 @@ def linearise(
     free = chain.free
     p = len(free)
     # The base, each parameter, then q and w of the segments unless all begin at rest.
-    states = 0 if data.stood.all() else 2
+    states = 0 if data.starts_at_rest.all() else 2
     count = p + 1 + states
     values = {q.name: np.full(count, chain.values[q.name]) for q in chain.parameters}
     difference = np.empty(p + 2)
@@ -86,11 +86,11 @@ def linearise(
     difference[p:] = 1e-6 * scales.volts, 1e-6 * scales.speed
     for j in range(states):
         own[j, p + 1 + j] = difference[p + j]
-    outputs = _outputs(chain, values, data, scales, initial, own)
+    outputs = _simulate_lanes(chain, values, data, scales, initial, own)
     derivatives = []
     for k, predicted in enumerate(outputs):
         lines = np.zeros((p + 3, data.known[k].size))
-        seen = _known(data, k, predicted)
+        seen = _select_measured(data, k, predicted)
         np.subtract(seen[1:], seen[0], out=lines[: count - 1])
         lines[: count - 1] /= difference[: count - 1, None]
         lines[p + 2] = 1.0 if data.is_angle and k == 0 else 0.0
@@ -104,28 +104,28 @@ def whiten(
     simulated: tuple[Array, ...], derivatives: tuple[Array, ...], exact: bool,
 ) -> Linear:  # fmt: skip
     """Return the residuals and derivatives of a simulation under a noise model."""
-    residuals, rows, _ = prior_rows(chain, scales)
+    residuals, rows, _ = build_prior_rows(chain, scales)
     m, p = data.row.size, len(chain.free)
     whole = np.zeros((p + 4, m + residuals.size))
     whole[0, m:], whole[1 : p + 1, m:] = residuals, rows.T
     first = 0
     for k, lines in enumerate(derivatives):
         part = whole[:, first : first + data.known[k].size]
-        part[:1] = _whitened_residual(data, k, noise[k], simulated[k])
-        part[1:] = noise[k].whiten(lines, _runs(data, k, noise[k]))
+        part[:1] = _whiten_residual(data, k, noise[k], simulated[k])
+        part[1:] = noise[k].whiten(lines, _select_runs(data, k, noise[k]))
         first += data.known[k].size
     if np.isfinite(data.huber):
-        whole[:, :m] *= _weight(whole[0, :m], data.huber)
+        whole[:, :m] *= _compute_huber_weights(whole[0, :m], data.huber)
     g = data.rows.segment.size - 1
     solved, inverse = np.zeros((g, 3, p + 1)), np.zeros((g, 3, 3))
-    pull = _pull(scales, initial)
-    prior = np.diag(_state_prior(scales))
+    pull = _compute_state_prior_gradient(scales, initial)
+    prior = np.diag(_compute_state_prior_weights(scales))
     for k, ends in enumerate(data.bounds):
         inner = np.zeros((3, p + 4))
         for first, last in ends:
             inner += whole[p + 1 :, first:last] @ whole[:, first:last].T
         inner[:, 0] -= pull[k]
-        free = slice(2, 3) if data.stood[k] else slice(0, 3)
+        free = slice(2, 3) if data.starts_at_rest[k] else slice(0, 3)
         small = (inner[:, p + 1 :] + prior)[free, free]
         size = np.diag(small)
         scale = np.sqrt(np.where(size > 0, size, 1.0))
@@ -142,51 +142,51 @@ def whiten(
     )  # fmt: skip
 
 
-def follow(
+def reuse_derivatives(
     data: Data, chain: Chain, scales: Scales, initial: Array, noise: Sequence[Noise], like: Linear
 ) -> Linear:
-    """Return the residuals of a chain beside the derivatives of another near it."""
-    simulated = _simulated(data, chain, scales, initial)
-    residual, solved = _eliminated(data, scales, initial, noise, simulated, like)
-    prior = prior_rows(chain, scales)[0]
+    """Return the residuals of a chain with the derivatives of another near it."""
+    simulated = _simulate(data, chain, scales, initial)
+    residual, solved = _eliminate_states(data, scales, initial, noise, simulated, like)
+    prior = build_prior_rows(chain, scales)[0]
     return replace(
         like, residual=np.concatenate([residual, prior]), local_step=solved, simulated=simulated,
         exact=False,
     )  # fmt: skip
 
 
-def residual(
+def compute_residual(
     data: Data, chain: Chain, scales: Scales, initial: Array, noise: Sequence[Noise], like: Linear
 ) -> Array | None:
     """Return the whitened residual of a chain, None if not finite.  Shape (m,).
 
     Initial states are fitted by the derivatives of another.
     """
-    simulated = _simulated(data, chain, scales, initial)
-    found, _ = _eliminated(data, scales, initial, noise, simulated, like)
+    simulated = _simulate(data, chain, scales, initial)
+    found, _ = _eliminate_states(data, scales, initial, noise, simulated, like)
     return found if np.isfinite(found).all() else None
 
 
-def settled(initial: Array, linear: Linear, step: Array) -> Array:
+def update_initial_states(initial: Array, linear: Linear, step: Array) -> Array:
     """Return the initial states that fit best after a step of the parameters."""
     out = initial.copy()
     out[:, :3] += linear.local_step - linear.local_gain @ step
     return out
 
 
-def prior_rows(chain: Chain, scales: Scales) -> tuple[Array, Array, tuple[str, ...]]:
+def build_prior_rows(chain: Chain, scales: Scales) -> tuple[Array, Array, tuple[str, ...]]:
     """Return residuals, rows and names of the components' priors."""
     names = [p.name for p in chain.free]
     residuals, rows, causes = [], [], []
     for component in chain.components:
-        for weights, mean, deviation in component.expected(scales):
+        for weights, mean, deviation in component.list_priors(scales):
             if any(n in names for n in weights):
                 at = sum(w * chain.values[n] for n, w in weights.items())
                 residuals.append((mean - at) / deviation)
                 rows.append([weights.get(n, 0.0) / deviation for n in names])
                 causes.append(next(iter(weights)))
     for constraint in chain.constraints:
-        row, off, size = _constrained(chain, constraint)
+        row, off, size = _linearise_constraint(chain, constraint)
         if size > 0:
             residuals.append(off / size)
             rows.append(list(row / size))
@@ -201,8 +201,8 @@ def prior_rows(chain: Chain, scales: Scales) -> tuple[Array, Array, tuple[str, .
     return np.array(residuals), made, tuple(causes)
 
 
-def _constrained(chain: Chain, constraint: Constraint) -> tuple[Array, float, float]:
-    """Return gradient, distance and deviation of a constraint; 0 for one that does not bind."""
+def _linearise_constraint(chain: Chain, constraint: Constraint) -> tuple[Array, float, float]:
+    """Return gradient, distance and deviation of a constraint; zeros if it is satisfied."""
     values, rows = jacobian(chain)
     if constraint.quantity not in values:
         return np.zeros(0), 0.0, 0.0
@@ -214,7 +214,7 @@ def _constrained(chain: Chain, constraint: Constraint) -> tuple[Array, float, fl
     return row, to - at, constraint.deviation * max(abs(to), 1e-12)
 
 
-def _outputs(
+def _simulate_lanes(
     chain: Chain, values: Mapping[str, Array], data: Data, scales: Scales, initial: Array,
     own: Array | None = None,
 ) -> list[Array]:  # fmt: skip
@@ -223,34 +223,36 @@ def _outputs(
     return [got.motion.T] if got.current is None else [got.motion.T, got.current.T]
 
 
-def _simulated(data: Data, chain: Chain, scales: Scales, initial: Array) -> tuple[Array, ...]:
+def _simulate(data: Data, chain: Chain, scales: Scales, initial: Array) -> tuple[Array, ...]:
     """Return every output of a chain, shape (n,)."""
     values = {p.name: np.array([chain.values[p.name]]) for p in chain.parameters}
-    return tuple(predicted[0] for predicted in _outputs(chain, values, data, scales, initial))
+    return tuple(
+        predicted[0] for predicted in _simulate_lanes(chain, values, data, scales, initial)
+    )
 
 
-def _whitened_residual(data: Data, k: int, noise: Noise, simulated: Array) -> Array:
+def _whiten_residual(data: Data, k: int, noise: Noise, simulated: Array) -> Array:
     """Return the whitened residual of an output, shape (1, known rows)."""
-    rest = _known(data, k, (data.outputs[k] - simulated)[None])
-    return noise.whiten(rest, _runs(data, k, noise))
+    rest = _select_measured(data, k, (data.outputs[k] - simulated)[None])
+    return noise.whiten(rest, _select_runs(data, k, noise))
 
 
-def _known(data: Data, k: int, lines: Array) -> Array:
+def _select_measured(data: Data, k: int, lines: Array) -> Array:
     """Return the measured rows of lines of an output, shape (c, n)."""
     known = data.known[k]
     return lines if known.size == lines.shape[1] else lines[:, known]
 
 
-def _eliminated(
+def _eliminate_states(
     data: Data, scales: Scales, initial: Array, noise: Sequence[Noise],
     simulated: tuple[Array, ...], like: Linear,
 ) -> tuple[Array, Array]:  # fmt: skip
-    """Return a whitened residual without its states, shape (m,), and their step, (segments, 3)."""
+    """Eliminate the initial states from a residual, shape (m,); return it and their step."""
     every = zip(noise, simulated, strict=True)
-    r = np.concatenate([_whitened_residual(data, k, *one)[0] for k, one in enumerate(every)])
+    r = np.concatenate([_whiten_residual(data, k, *one)[0] for k, one in enumerate(every)])
     if np.isfinite(data.huber):
-        r *= _weight(r, data.huber)
-    pull = _pull(scales, initial)
+        r *= _compute_huber_weights(r, data.huber)
+    pull = _compute_state_prior_gradient(scales, initial)
     solved = np.zeros((len(pull), 3))
     for k, ends in enumerate(data.bounds):
         right = -pull[k]
@@ -262,21 +264,21 @@ def _eliminated(
     return r, solved
 
 
-def _runs(data: Data, k: int, noise: Noise) -> Integers:
+def _select_runs(data: Data, k: int, noise: Noise) -> Integers:
     return data.whole_runs[k] if noise.over_gaps else data.runs[k]
 
 
-def _weight(residual: Array, huber: float) -> Array:
+def _compute_huber_weights(residual: Array, huber: float) -> Array:
     """Return the square root of the weights of a robust loss."""
     return np.asarray(np.sqrt(np.minimum(1.0, huber / np.maximum(np.abs(residual), 1e-300))))
 
 
-def _state_prior(scales: Scales) -> Array:
+def _compute_state_prior_weights(scales: Scales) -> Array:
     """Return the weights of the priors of q, speed and angle at the beginning of a segment."""
-    sizes = PRIOR_STATE * np.array([scales.volts, scales.speed, np.inf])
+    sizes = INITIAL_STATE_PRIOR_STD * np.array([scales.volts, scales.speed, np.inf])
     return np.asarray(sizes**-2.0)
 
 
-def _pull(scales: Scales, initial: Array) -> Array:
+def _compute_state_prior_gradient(scales: Scales, initial: Array) -> Array:
     """Return the gradient of the priors of the initial states, shape (segments, 3)."""
-    return np.asarray(_state_prior(scales) * initial[:, :3])
+    return np.asarray(_compute_state_prior_weights(scales) * initial[:, :3])

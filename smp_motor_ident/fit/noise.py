@@ -21,7 +21,7 @@ from smp_motor_control.arrays import Array, Integers
 from smp_motor_ident._compile import compiled
 
 MAX_ORDER = 24
-LEAST = 1e-300  # variance
+MIN_VARIANCE = 1e-300
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,17 +44,17 @@ class Noise:
     @classmethod
     def white(cls, deviation: float) -> Noise:
         """Return noise without memory."""
-        return cls(np.zeros((1, 0)), np.array([max(deviation, math.sqrt(LEAST))]))
+        return cls(np.zeros((1, 0)), np.array([max(deviation, math.sqrt(MIN_VARIANCE))]))
 
     @classmethod
     def integrated(cls, deviation: float) -> Noise:
         """Return noise whose difference from row to row is white."""
-        last = max(deviation, math.sqrt(LEAST))
+        last = max(deviation, math.sqrt(MIN_VARIANCE))
         return cls(np.array([[0.0], [1.0]]), np.array([1e3 * last, last]), True)
 
     def whiten(self, lines: Array, runs: Integers) -> Array:
         """Return lines of shape (c, n) whitened."""
-        return _whiten(lines, runs, self.predictors, self.deviation)
+        return _whiten_lines(lines, runs, self.predictors, self.deviation)
 
     def log_determinant(self, runs: Integers) -> float:
         """Return the logarithm of the determinant of the noise's covariance over all runs."""
@@ -62,11 +62,11 @@ class Noise:
         total = 0.0
         for m in range(self.order):
             total += 2 * math.log(self.deviation[m]) * int((length > m).sum())
-        most = int(np.maximum(length - self.order, 0).sum())
-        return total + 2 * math.log(self.deviation[-1]) * most
+        count = int(np.maximum(length - self.order, 0).sum())
+        return total + 2 * math.log(self.deviation[-1]) * count
 
 
-def runs_of(rows: Integers, segment: Integers, gap: int) -> Integers:
+def find_runs(rows: Integers, segment: Integers, gap: int) -> Integers:
     """Return first and end of runs of rows within a segment that are at most ``gap`` apart."""
     which = np.searchsorted(segment, rows, side="right")
     ends = np.flatnonzero((np.diff(which) > 0) | (np.diff(rows) > gap)) + 1
@@ -74,15 +74,15 @@ def runs_of(rows: Integers, segment: Integers, gap: int) -> Integers:
     return np.stack([bounds[:-1], bounds[1:]], axis=1).astype(np.int64)
 
 
-def fit_noise(residual: Array, runs: Integers, most: int = MAX_ORDER) -> Noise:
+def fit_noise(residual: Array, runs: Integers, max_order: int = MAX_ORDER) -> Noise:
     """Return the noise that a residual shows, shape (n,)."""
     count = int((runs[:, 1] - runs[:, 0]).sum())
-    most = max(0, min(most, count // 20))
-    reflection, variance = _burg(residual, runs, most)
+    max_order = max(0, min(max_order, count // 20))
+    reflection, variance = _estimate_reflections(residual, runs, max_order)
     # Below its rounding a residual tells nothing.
-    floor = max(LEAST, 1e-26 * float(variance[0]))
+    floor = max(MIN_VARIANCE, 1e-26 * float(variance[0]))
     variance = np.maximum(variance, floor)
-    orders = np.arange(most + 1)
+    orders = np.arange(max_order + 1)
     best = int(np.argmin(count * np.log(variance) + math.log(max(count, 2)) * orders))
     predictors = np.zeros((best + 1, best))
     for m in range(1, best + 1):
@@ -100,17 +100,17 @@ def fit_noise(residual: Array, runs: Integers, most: int = MAX_ORDER) -> Noise:
 
 
 @compiled
-def _burg(residual: Array, runs: Integers, most: int) -> tuple[Array, Array]:
+def _estimate_reflections(residual: Array, runs: Integers, max_order: int) -> tuple[Array, Array]:
     """Return reflection coefficients and the variance of the prediction's error of every order."""
     forward, backward = residual.copy(), residual.copy()
-    reflection, variance = np.zeros(most), np.zeros(most + 1)
+    reflection, variance = np.zeros(max_order), np.zeros(max_order + 1)
     total, count = 0.0, 0
     for r in range(runs.shape[0]):
         for k in range(runs[r, 0], runs[r, 1]):
             total += residual[k] * residual[k]
             count += 1
     variance[0] = total / max(count, 1)
-    for m in range(1, most + 1):
+    for m in range(1, max_order + 1):
         top = bottom = 0.0
         for r in range(runs.shape[0]):
             for k in range(runs[r, 0] + m, runs[r, 1]):
@@ -128,15 +128,15 @@ def _burg(residual: Array, runs: Integers, most: int) -> tuple[Array, Array]:
 
 
 @compiled
-def _whiten(lines: Array, runs: Integers, predictors: Array, deviation: Array) -> Array:
+def _whiten_lines(lines: Array, runs: Integers, predictors: Array, deviation: Array) -> Array:
     count, n = lines.shape
-    most = predictors.shape[1]
-    scale = 1.0 / deviation[most]
+    order = predictors.shape[1]
+    scale = 1.0 / deviation[order]
     out = np.zeros((count, n))
     for j in range(count):
         for r in range(runs.shape[0]):
             first, last = runs[r, 0], runs[r, 1]
-            begun = min(first + most, last)
+            begun = min(first + order, last)
             for k in range(first, begun):
                 m = k - first
                 x = lines[j, k]
@@ -145,8 +145,8 @@ def _whiten(lines: Array, runs: Integers, predictors: Array, deviation: Array) -
                 out[j, k] = x / deviation[m]
             for k in range(begun, last):
                 out[j, k] = scale * lines[j, k]
-            for i in range(most):
-                a = scale * predictors[most, i]
+            for i in range(order):
+                a = scale * predictors[order, i]
                 for k in range(begun, last):
                     out[j, k] -= a * lines[j, k - 1 - i]
     return out

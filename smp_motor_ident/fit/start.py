@@ -21,13 +21,13 @@ from smp_motor_ident.chain.sensor import Angle, Speed
 from smp_motor_ident.fit.data import Data
 from smp_motor_ident.simulate.rows import Rows
 
-LAGS = 28
+LAG_COUNT = 28
 FRICTIONS = (0.0, 0.04, 0.12, 0.3)  # of the largest command
 DELAYS = (0.0, 1.0, 3.0)  # rows
 LONG_DELAYS = (10.0, 20.0, 40.0, 80.0, 160.0, 320.0)  # rows
-POOR = 0.1  # share of the output's energy that a start leaves, from which long delays are tried
-ROWS = 3000
-NEAR = 0.5  # difference of a logarithm between two starts, at least
+MAX_GOOD_COST = 0.1  # unexplained share of the output; above it long delays are tried
+MAX_GRID_ROWS = 3000
+MIN_LOG_DISTANCE = 0.5  # between two starts
 
 
 class _LongDelay(Delay):
@@ -38,16 +38,16 @@ class _LongDelay(Delay):
         return [{"delay": rows * scales.step} for rows in LONG_DELAYS]
 
 
-def guesses(data: Data, best: int = 3, component: Component | None = None) -> list[Chain]:
-    """Return first-order motors that explain the speed best, the likeliest first.
+def guess_motors(data: Data, best: int = 3, component: Component | None = None) -> list[Chain]:
+    """Return the first-order motors that explain the speed best, the best first.
 
-    With a ``component`` all of them have it, in all sizes at which a fit with it begins.  The speed
-    is ``f(v; lag, friction)/a0`` where f does not depend on a0, which linear regression tells.
+    With a ``component`` all of them have it, in each of its starting sizes.  The speed is
+    ``f(v; lag, friction)/a0``, where f does not depend on a0: a0 follows by linear regression.
     """
     scored: list[tuple[float, Chain]] = []
-    for view in views(data):
+    for view in select_views(data):
         scored += _score_grid(view, component, DELAYS if component is None else (0.0,))
-        if component is None and min((cost for cost, _ in scored), default=1.0) > POOR:
+        if component is None and min((cost for cost, _ in scored), default=1.0) > MAX_GOOD_COST:
             scored += _score_grid(view, _LongDelay(), (0.0,))
     scored.sort(key=lambda one: one[0])
     found: list[Chain] = []
@@ -58,37 +58,37 @@ def guesses(data: Data, best: int = 3, component: Component | None = None) -> li
 
 
 def _are_near(one: Chain, other: Chain) -> bool:
-    """Tell whether fits from two motors would end at the same."""
+    """Tell whether fits from two motors would end at the same minimum."""
     names = ("ln_a0", "ln_a1")
-    near = all(abs(one.values[n] - other.values[n]) < NEAR for n in names)
+    near = all(abs(one.values[n] - other.values[n]) < MIN_LOG_DISTANCE for n in names)
     return near and one.values.get("delay") == other.values.get("delay")
 
 
-def views(data: Data) -> Iterator[Data]:
+def select_views(data: Data) -> Iterator[Data]:
     """Yield the first rows that move, and the whole record thinned."""
     rows = data.rows
     if data.is_angle:  # fill in the readings at rest, which fits leave out
-        data = replace(data, motion=filled(data.motion, rows.segment))
+        data = replace(data, motion=hold_last_value(data.motion, rows.segment))
     moves = np.abs(rows.command) > 0.05 * data.volts
     begin = rows.begin[int(np.argmax(moves))] if moves.any() else 0.0
     first = max(int(np.searchsorted(rows.time[: rows.segment[1]], begin)) - 5, 0)
-    last = min(first + ROWS, int(rows.segment[1]))
-    held = command_of(rows)
-    yield _held(data, rows.time[first:last], held[first:last], data.motion[first:last])
-    every = -(-len(data) // ROWS)
+    last = min(first + MAX_GRID_ROWS, int(rows.segment[1]))
+    held = average_command(rows)
+    yield _replace_rows(data, rows.time[first:last], held[first:last], data.motion[first:last])
+    every = -(-len(data) // MAX_GRID_ROWS)
     if every > 1 or rows.segment.size > 2:
         yield _average_rows(data, held, every)
 
 
-def filled(values: Array, segment: Integers) -> Array:
-    """Return values with the last known one of the segment in place of those that are missing."""
+def hold_last_value(values: Array, segment: Integers) -> Array:
+    """Replace missing values by the last known one of the segment."""
     known = np.isfinite(values)
     known[segment[:-1]] = True
     last = np.maximum.accumulate(np.where(known, np.arange(values.size), 0))
     return np.asarray(values[last])
 
 
-def command_of(rows: Rows) -> Array:
+def average_command(rows: Rows) -> Array:
     """Return the mean command over the interval that ends at each row [V]."""
     pieces = rows.pieces(0.0)
     put = pieces.length * rows.command[pieces.section]
@@ -98,18 +98,20 @@ def command_of(rows: Rows) -> Array:
     return np.where(some, total / np.where(some, rows.interval, 1.0), last)
 
 
-def _held(
+def _replace_rows(
     data: Data, time: Array, command: Array, motion: Array, segment: Integers | None = None
 ) -> Data:
     bounds = np.array([0, time.size]) if segment is None else segment
     rows = Rows.held(time, command, bounds)
     start = np.zeros((bounds.size - 1, 4))
     still = np.zeros(bounds.size - 1, dtype=np.bool_)
-    return replace(data, rows=rows, motion=motion, current=None, initial=start, stood=still)
+    return replace(
+        data, rows=rows, motion=motion, current=None, initial=start, starts_at_rest=still
+    )
 
 
 def _average_rows(data: Data, held: Array, every: int) -> Data:
-    """Return every so many rows of all segments, each command the mean since the row before."""
+    """Keep one of every ``every`` rows, each with the mean command since the row before."""
     rows = data.rows
     times, commands, outputs, starts = [], [], [], [0]
     for a, b in pairwise(rows.segment):
@@ -124,9 +126,9 @@ def _average_rows(data: Data, held: Array, every: int) -> Data:
         outputs.append(data.motion[k])
         starts.append(starts[-1] + k.size)
     if not times:
-        return _held(data, rows.time, held, data.motion, rows.segment)
+        return _replace_rows(data, rows.time, held, data.motion, rows.segment)
     time, command, motion = map(np.concatenate, (times, commands, outputs))
-    return _held(data, time, command, motion, np.array(starts))
+    return _replace_rows(data, time, command, motion, np.array(starts))
 
 
 def _score_grid(
@@ -135,7 +137,7 @@ def _score_grid(
     """Return every motor of the grid with its cost, as a share of the output's own."""
     rows = data.rows
     span = float(rows.interval.sum())
-    lags = np.geomspace(0.3 * rows.step, max(span / 3, 3 * rows.step), LAGS)
+    lags = np.geomspace(0.3 * rows.step, max(span / 3, 3 * rows.step), LAG_COUNT)
     interval = np.where(rows.interval > 0, rows.interval, np.nan)
     speed = np.diff(data.motion, prepend=np.nan) / interval if data.is_angle else data.motion
     ok = np.isfinite(speed)
@@ -143,7 +145,7 @@ def _score_grid(
     sensor = Angle() if data.is_angle else Speed()
     chain = Chain((FirstOrder(), sensor), {"ln_a0": 0.0, "ln_a1": 0.0})
     chain = chain.with_component(Friction(), {"vc": 0.0})
-    extra: list[list[Mapping[str, float]]] = [[{}] * LAGS]
+    extra: list[list[Mapping[str, float]]] = [[{}] * LAG_COUNT]
     if component is not None:
         sizes = [component.starts(data.scales(lag)) for lag in lags]
         extra = [list(one) for one in zip(*sizes, strict=True)]
@@ -153,13 +155,15 @@ def _score_grid(
         for share in FRICTIONS:
             for size in extra:
                 values = {
-                    "ln_a0": np.zeros(LAGS), "ln_a1": np.log(lags),
-                    "vc": np.full(LAGS, share * data.volts),
+                    "ln_a0": np.zeros(LAG_COUNT), "ln_a1": np.log(lags),
+                    "vc": np.full(LAG_COUNT, share * data.volts),
                     **{n: np.array([one[n] for one in size]) for n in size[0]},
                 }  # fmt: skip
                 if "delay" not in values:
-                    values["delay"] = np.full(LAGS, delay * rows.step)
-                x = respond(chain, values, rows, data.scales(lags[LAGS // 2]), data.initial).motion
+                    values["delay"] = np.full(LAG_COUNT, delay * rows.step)
+                x = respond(
+                    chain, values, rows, data.scales(lags[LAG_COUNT // 2]), data.initial
+                ).motion
                 if data.is_angle:
                     x = np.diff(x, axis=0, prepend=np.nan) / interval[:, None]
                 x = x[ok]

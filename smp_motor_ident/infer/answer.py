@@ -16,7 +16,7 @@ import numpy as np
 
 from smp_motor_control.arrays import Array
 from smp_motor_control.motor.parameters import PHYSICAL
-from smp_motor_ident.chain.catalogue import component_of
+from smp_motor_ident.chain.catalogue import find_component
 from smp_motor_ident.chain.quantities import HIDDEN, jacobian
 from smp_motor_ident.fit.data import Data
 from smp_motor_ident.fit.descend import Fit
@@ -26,20 +26,20 @@ from smp_motor_ident.limits import CURRENT_ACCURACY, LOOSE_QUANTITY, ONE_SIZE_AC
 from smp_motor_ident.record import Hardware
 from smp_motor_ident.result import NORMAL_95, UNITS, Quantity, Share, Systematic
 
-BY_CURRENT: Mapping[str, float] = {
+SCALE_POWERS: Mapping[str, float] = {
     "resistance": -1.0, "inductance": -1.0, "inertia": 1.0, "viscous_friction": 1.0,
     "coulomb_friction": 1.0,
 }  # fmt: skip
 """Powers of the current's scale: with a current s times as large the same motion and voltage are
 those of R/s, L/s, s J, s b and s Tc, and of the same K."""
-CAUSES = {
+CAUSE_OF_PRIOR = {
     "window": "averaged_speed",
     "vc": "one_level", "viscous": "damping", "ln_a2": "second_lag", "ln_a0": "prior_gain",
 }  # fmt: skip
-"""Names of the systematic uncertainty that rests on the prior of a parameter."""
+"""Name of the systematic uncertainty by the prior of a parameter."""
 MAX_SHARES = 3
-LEAST_SHARE = 1e-6  # share of a number below which a systematic uncertainty is none
-WORTH = 0.25  # systematic over random uncertainty from which it is stated
+MIN_SYSTEMATIC_SHARE = 1e-6  # of a number
+MIN_STATED_RATIO = 0.25  # of a systematic to the random uncertainty
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,11 +53,11 @@ class Answer:
     systematic: tuple[Systematic, ...]
 
 
-def answer(
+def state_quantities(
     data: Data, found: Fit, parts: Sequence[Contribution], levels: Levels, hardware: Hardware,
     known: Mapping[str, float],
 ) -> Answer:  # fmt: skip
-    """Return the quantities that a fit tells, and those that the data leave open.
+    """Return the quantities of a fit, and those that the data leave open.
 
     ``parts`` are the contributions to the uncertainty of the chain's parameters, ``known`` the
     values that the user fixed, by the names of `result.UNITS`.
@@ -71,88 +71,89 @@ def answer(
     rows = rows[stated]
     covariance = rows @ sum(p.covariance for p in parts) @ rows.T
     names = tuple(values)
-    systematic = tuple(_merged(_systematic(names, values, rows, parts, levels, hardware, found)))
+    errors = _list_systematic(names, values, rows, parts, levels, hardware, found)
+    systematic = tuple(_add_in_quadrature(errors))
     std = np.sqrt(np.maximum(np.diag(covariance), 0.0))
     made = {}
     for k, name in enumerate(names):
         if name in known:
             made[name] = Quantity(known[name], unit=UNITS[name], status="fixed")
             continue
-        shares = _shares(name, values[name], float(std[k]), systematic)
+        shares = _select_shares(name, values[name], float(std[k]), systematic)
         valid = {"voltage": (-levels.one_size, levels.one_size)} if levels.one_size else None
         holds_there = any(s.cause in ("one_size_of_voltage", "one_level") for s in shares)
-        made[name] = _quantity(
+        made[name] = _make_quantity(
             name, values[name], float(std[k]), shares, valid if holds_there else None
         )
     return Answer(
-        {n: made.get(n, _unknown(n, known)) for n in PHYSICAL},
+        {n: made.get(n, _make_unknown_quantity(n, known)) for n in PHYSICAL},
         {n: q for n, q in made.items() if n not in PHYSICAL},
         names, covariance, systematic,
     )  # fmt: skip
 
 
-def _unknown(name: str, known: Mapping[str, float]) -> Quantity:
+def _make_unknown_quantity(name: str, known: Mapping[str, float]) -> Quantity:
     if name in known:
         return Quantity(known[name], unit=UNITS[name], status="fixed")
     return Quantity(None, unit=UNITS[name], status="unidentifiable")
 
 
-def _quantity(
+def _make_quantity(
     name: str, value: float, std: float, shares: tuple[Share, ...],
     valid: Mapping[str, tuple[float, float]] | None,
 ) -> Quantity:  # fmt: skip
-    """Return one number, without a value where it is not known to half of itself."""
+    """Return one quantity, without a value if it is uncertain by more than half of itself."""
     low, high = value - NORMAL_95 * std, value + NORMAL_95 * std
     positive = name not in ("delay", "load_voltage", "steady_speed")
     low = max(low, 0.0) if positive else low
     made = Quantity(value, std, (low, high), UNITS[name], "estimated", shares, valid)
-    of_priors = math.hypot(std, *(s.size for s in shares if s.cause in CAUSES.values()))
-    loose = name in OPEN and of_priors > LOOSE_QUANTITY * abs(value)
+    of_priors = math.hypot(std, *(s.size for s in shares if s.cause in CAUSE_OF_PRIOR.values()))
+    loose = name in WITHHELD_IF_LOOSE and of_priors > LOOSE_QUANTITY * abs(value)
     if loose or not math.isfinite(std):
         ends = made.total_ci95 or (low, high)
         return Quantity(None, None, (max(ends[0], 0.0), ends[1]), UNITS[name], "unidentifiable")
     return made
 
 
-OPEN = ("time_constant_product", "inductance", "time_constant", "dc_gain")
-"""Quantities that are not stated where they are not known to half of themselves."""
+WITHHELD_IF_LOOSE = ("time_constant_product", "inductance", "time_constant", "dc_gain")
+"""Quantities without a value if they are uncertain by more than half of themselves."""
 
 
-def _systematic(
+def _list_systematic(
     names: Sequence[str], values: Mapping[str, float], rows: Array,
     parts: Sequence[Contribution], levels: Levels, hardware: Hardware, found: Fit,
 ) -> Iterator[Systematic]:  # fmt: skip
-    """Yield every error that no recording shows, and the change of every number."""
+    """Yield every systematic error and the change of every quantity by it."""
     for part in parts:
-        if part.unseen is None or not np.any(part.unseen):
+        if part.systematic_shift is None or not np.any(part.systematic_shift):
             continue
-        moves = rows @ part.unseen
+        moves = rows @ part.systematic_shift
         if "steady_speed" in names:  # which was observed, whatever the chain
             moves[names.index("steady_speed")] = 0.0
-        cause = CAUSES.get(part.name, part.name)
-        component = component_of(part.name)
+        cause = CAUSE_OF_PRIOR.get(part.name, part.name)
+        component = find_component(part.name)
         if component is not None and component.slot in DRIVER_SLOTS and levels.one_size:
             cause = "one_size_of_voltage"
             if hardware.voltage_accuracy is not None:
                 moves = moves * hardware.voltage_accuracy / ONE_SIZE_ACCURACY
-        share = _largest(moves, values)
-        if share > LEAST_SHARE or part.adds:
+        share = _find_largest_share(moves, values)
+        if share > MIN_SYSTEMATIC_SHARE or part.adds:
             moved = dict(zip(names, map(float, moves))) | dict(part.adds)
             yield Systematic(cause, share, moved)
     if "ln_r" in found.names:
         accuracy = hardware.current_accuracy
         share = CURRENT_ACCURACY if accuracy is None else accuracy
-        moves_of = {n: share * p * values[n] for n, p in BY_CURRENT.items() if n in values}
+        moves_of = {n: share * p * values[n] for n, p in SCALE_POWERS.items() if n in values}
         yield Systematic("current_scale", share, moves_of)
 
 
-def _largest(moves: Array, values: Mapping[str, float]) -> float:
+def _find_largest_share(moves: Array, values: Mapping[str, float]) -> float:
     shares = (abs(m / v) for m, v in zip(moves, values.values(), strict=True) if v)
     return float(max(shares, default=0.0))
 
 
-def _merged(every: Iterator[Systematic]) -> Iterator[Systematic]:
-    """Yield errors, those of one cause added in quadrature."""
+def _add_in_quadrature(every: Iterator[Systematic]) -> Iterator[Systematic]:
+    """Add errors of one cause in quadrature."""
     by_cause: dict[str, list[Systematic]] = {}
     for one in every:
         by_cause.setdefault(one.cause, []).append(one)
@@ -165,14 +166,14 @@ def _merged(every: Iterator[Systematic]) -> Iterator[Systematic]:
         yield Systematic(cause, max(s.share for s in some), moves)
 
 
-def _shares(
+def _select_shares(
     name: str, value: float, std: float, systematic: Sequence[Systematic]
 ) -> tuple[Share, ...]:
-    """Return the systematic uncertainties of a number that are worth a word, the largest first."""
+    """Return the systematic uncertainties that are worth stating, the largest first."""
     made = [
         Share(s.cause, abs(s.moves[name] / value) if value else None, abs(s.moves[name]))
         for s in systematic
         if s.moves.get(name)
     ]
-    made = [s for s in made if s.size > WORTH * std and s.size > 1e-4 * abs(value)]
+    made = [s for s in made if s.size > MIN_STATED_RATIO * std and s.size > 1e-4 * abs(value)]
     return tuple(sorted(made, key=lambda s: -s.size)[:MAX_SHARES])

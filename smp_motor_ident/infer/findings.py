@@ -18,18 +18,18 @@ from smp_motor_ident.finding import Finding
 from smp_motor_ident.fit.adequacy import Scatter
 from smp_motor_ident.fit.data import Data, prepare
 from smp_motor_ident.fit.descend import Fit, approach, fit
-from smp_motor_ident.fit.start import guesses
-from smp_motor_ident.infer.answer import BY_CURRENT, Answer
+from smp_motor_ident.fit.start import guess_motors
+from smp_motor_ident.infer.answer import SCALE_POWERS, Answer
 from smp_motor_ident.infer.levels import Levels
 from smp_motor_ident.infer.uncertainty import Contribution
-from smp_motor_ident.infer.validation import explained, white_share
+from smp_motor_ident.infer.validation import compute_explained_percent, estimate_white_share
 from smp_motor_ident.limits import FRICTION_MOST
-from smp_motor_ident.quality.screen import where_of
-from smp_motor_ident.quality.units import implausible_motor
+from smp_motor_ident.quality.screen import name_records
+from smp_motor_ident.quality.units import check_plausibility
 from smp_motor_ident.record import Record
 from smp_motor_ident.result import UNITS, FitPercent, Quantity, ResidualTests
 
-PLAIN = (
+UNREPORTED_COMPONENTS = (
     "first_order",
     "second_order",
     "electromechanical",
@@ -40,20 +40,20 @@ PLAIN = (
     "current",
 )
 """Components without a finding."""
-STANDING = 0.9  # share of white noise in a motion above which the motor is at rest
-SIGNIFICANT = 3.0
-"""Standard deviations by which a size differs from zero before a warning is given of it."""
-UNTOLD = ("current_offset", "vc", "eccentric_phase")
+MIN_REST_NOISE_SHARE = 0.9  # of white noise in the motion of a motor at rest
+MIN_SIGNIFICANT_SIZE = 3.0
+"""Size over its standard deviation from which an effect is a warning."""
+UNREPORTED_PARAMETERS = ("current_offset", "vc", "eccentric_phase")
 """Parameters omitted from messages about their component."""
-DISAGREEMENT = 2.5  # scatter between parts of a record, over chance, that is said
-FINE = 0.02
-"""Relative standard deviation by such a scatter up to which a number serves all the same."""
-UNUSABLE = 0.2  # relative standard deviation by such a scatter from which a number is unreliable
+MIN_REPORTED_SCATTER = 2.5  # between parts of a record, over chance
+MAX_NOTE_STD = 0.02
+"""Relative standard deviation of a quantity up to which such a scatter is a note."""
+MAX_WARNING_STD = 0.2  # the same for a warning; above it a quantity is unreliable
 
 
 @dataclass(frozen=True, eq=False)
-class Judged:
-    """Fit and quantities of an estimate, for its findings."""
+class EstimateContext:
+    """Data, fit and quantities of an estimate, which its findings assess."""
 
     group: Sequence[Record]
     data: Data
@@ -67,7 +67,7 @@ class Judged:
     known: Mapping[str, float]
 
     @property
-    def top(self) -> float:
+    def largest_command(self) -> float:
         """Largest command [V]."""
         return self.data.volts
 
@@ -84,32 +84,35 @@ class Judged:
         return own > 0 and float(np.nanstd(left)) < math.sqrt(limits.UNEXPLAINED) * own
 
 
-def refuse(judged: Judged) -> None:
+def refuse_unexplained(context: EstimateContext) -> None:
     """Refuse an estimate that does not explain the recording."""
-    fitted = max(judged.percent.estimation or 0.0, explained(judged.data, judged.found.motion))
-    where = where_of(judged.group)
-    enough = fitted >= limits.WORST_FIT or judged.within_resolution
-    if not enough and not _nearly_constant(judged):
-        if white_share(judged.data) > STANDING:
+    fitted = max(
+        context.percent.estimation or 0.0,
+        compute_explained_percent(context.data, context.found.motion),
+    )
+    where = name_records(context.group)
+    enough = fitted >= limits.WORST_FIT or context.within_resolution
+    if not enough and not _is_nearly_constant(context):
+        if estimate_white_share(context.data) > MIN_REST_NOISE_SHARE:
             raise InsufficientExcitationError(
                 f"{where}: the motor is at rest, its sensor shows only noise; raise the voltage"
             )
-        _refuse_angle(where, judged.group)
+        _refuse_angle(where, context.group)
         raise SignalError(
             f"{where}: the voltage does not explain the motion (fit {fitted:.0f} %); check "
             "that voltage and encoder belong to the same motor, that the driver applies the "
             "command, and that nothing else drives the motor"
         )
-    offset = abs(judged.found.chain.values.get("current_offset", 0.0))
-    if offset and judged.data.current is not None:
-        largest = float(np.nanmax(np.abs(judged.data.current)))
+    offset = abs(context.found.chain.values.get("current_offset", 0.0))
+    if offset and context.data.current is not None:
+        largest = float(np.nanmax(np.abs(context.data.current)))
         if offset > limits.LARGEST_OFFSET * max(largest - offset, 1e-12):
             raise CurrentError(
                 f"{where}: current has an offset of {offset:.3g} A where it reaches "
                 f"{largest:.3g} A; zero the current sensor at rest and record again"
             )
-    if judged.quantity("dc_gain") is None and judged.quantity("steady_speed") is None:
-        _refuse_angle(where, judged.group)
+    if context.quantity("dc_gain") is None and context.quantity("steady_speed") is None:
+        _refuse_angle(where, context.group)
         raise InsufficientExcitationError(
             f"{where}: the data do not determine the DC gain; record a longer excitation with "
             "several frequencies, in both directions and well above the friction"
@@ -122,43 +125,43 @@ def _refuse_angle(where: str, group: Sequence[Record]) -> None:
         return
     angles = [replace(r, velocity=None, position=r.velocity) for r in group]
     data = prepare(angles, use_current=False)
-    for chain in guesses(data, 1):
+    for chain in guess_motors(data, 1):
         found = fit(data, approach(data, chain, data.scales(1.0), data.initial), rounds=1)
-        if explained(data, found.motion) > limits.FIT_EXPLAINS:
+        if compute_explained_percent(data, found.motion) > limits.FIT_EXPLAINS:
             raise SignalError(
                 f"{where}: the speed follows the voltage as an angle does; map it as position"
             )
 
 
-def _nearly_constant(judged: Judged) -> bool:
-    """Tell whether the speed hardly changes: its scatter is the sensor's, and no share tells."""
-    speed = judged.data.speed[np.isfinite(judged.data.speed)]
+def _is_nearly_constant(context: EstimateContext) -> bool:
+    """Tell whether the speed hardly changes, so that its scatter is the sensor's."""
+    speed = context.data.speed[np.isfinite(context.data.speed)]
     size = float(np.sqrt(np.mean(np.square(speed)))) if speed.size else 0.0
     return size > 0 and float(np.std(speed)) < 0.1 * size
 
 
-def findings_of(judged: Judged) -> list[Finding]:
-    """Return the findings on an estimate, the gravest kinds first."""
+def collect_findings(context: EstimateContext) -> list[Finding]:
+    """Collect the findings on an estimate, the most severe kinds first."""
     return [
-        *_fit(judged),
-        *_disagreement(judged),
-        *_lag_unknown(judged),
-        *_friction_dominates(judged),
-        *_plausible(judged),
-        *_chain(judged),
-        *_levels(judged),
-        *_driving_load(judged),
-        *_current_offset(judged),
-        *_current_scale(judged),
-        *_torque_noise(judged),
-        *_separable(judged),
+        *_check_fit(context),
+        *_check_disagreement(context),
+        *_check_time_constant(context),
+        *_check_friction(context),
+        *_check_plausibility(context),
+        *_report_components(context),
+        *_report_levels(context),
+        *_report_driving_load(context),
+        *_report_current_offset(context),
+        *_report_current_scale(context),
+        *_report_torque_noise(context),
+        *_report_unidentified(context),
     ]
 
 
-def _fit(judged: Judged) -> Iterator[Finding]:
-    estimation, validation = judged.percent.estimation or 0.0, judged.percent.validation
-    estimation = max(estimation, explained(judged.data, judged.found.motion))
-    if estimation < limits.FIT_EXPLAINS and not judged.within_resolution:
+def _check_fit(context: EstimateContext) -> Iterator[Finding]:
+    estimation, validation = context.percent.estimation or 0.0, context.percent.validation
+    estimation = max(estimation, compute_explained_percent(context.data, context.found.motion))
+    if estimation < limits.FIT_EXPLAINS and not context.within_resolution:
         yield Finding(
             "poor_fit", "unreliable",
             f"the model explains {estimation:.0f} % of the speed; at least "
@@ -167,9 +170,9 @@ def _fit(judged: Judged) -> Iterator[Finding]:
             "look for a second cause of the motion, such as a load, and record the driver's output "
             "voltage",
         )  # fmt: skip
-    fitted = judged.percent.estimation or 0.0
+    fitted = context.percent.estimation or 0.0
     falls = validation is not None and validation < fitted - limits.FIT_HOLDS
-    if falls and not judged.within_resolution:
+    if falls and not context.within_resolution:
         yield Finding(
             "validation", "unreliable",
             f"the model explains {validation:.0f} % of the held-out speed and {fitted:.0f} % "
@@ -179,20 +182,21 @@ def _fit(judged: Judged) -> Iterator[Finding]:
         )  # fmt: skip
 
 
-def _disagreement(judged: Judged) -> Iterator[Finding]:
+def _check_disagreement(context: EstimateContext) -> Iterator[Finding]:
     """Report significantly different parameters in parts of a record."""
-    worst = max(judged.scatters, key=lambda s: s.ratio, default=None)
-    if worst is None or worst.ratio < DISAGREEMENT:
+    worst = max(context.scatters, key=lambda s: s.ratio, default=None)
+    if worst is None or worst.ratio < MIN_REPORTED_SCATTER:
         return
     spread = max(
         (q.std or 0.0) / abs(q.value or 1.0)
-        for n in ("steady_speed" if judged.levels.steady else "dc_gain", "time_constant")
-        if (q := judged.quantity(n)) is not None
-    ) if judged.quantity("dc_gain") else 1.0  # fmt: skip
+        for n in ("steady_speed" if context.levels.steady else "dc_gain", "time_constant")
+        if (q := context.quantity(n)) is not None
+    ) if context.quantity("dc_gain") else 1.0  # fmt: skip
     parts = {"autocorrelation": "stretches of the record", "speed": "slow and fast motion",
              "acceleration": "steady and changing motion"}  # fmt: skip
     yield Finding(
-        "misfit", "unreliable" if spread > UNUSABLE else "warning" if spread > FINE else "note",
+        "misfit", "unreliable" if spread > MAX_WARNING_STD
+        else "warning" if spread > MAX_NOTE_STD else "note",
         f"{parts[worst.name]} disagree {math.sqrt(worst.ratio):.1f} times more than noise explains:"
         f" the model lacks an effect, and the intervals are widened to {100 * spread:.2g} %",
         {"ratio": worst.ratio, "partition": worst.name, "spread": spread},
@@ -200,97 +204,97 @@ def _disagreement(judged: Judged) -> Iterator[Finding]:
     )  # fmt: skip
 
 
-def _lag_unknown(judged: Judged) -> Iterator[Finding]:
-    lag = judged.answer.combinations.get("time_constant")
+def _check_time_constant(context: EstimateContext) -> Iterator[Finding]:
+    lag = context.answer.combinations.get("time_constant")
     if lag is None or lag.value is not None or lag.ci95 is None:
         return
     low, high = lag.ci95
-    quick = high < judged.data.rows.step
+    quick = high < context.data.rows.step
     yield Finding(
         "lag_unknown", "warning" if quick else "unreliable",
         f"the time constant is only known to lie between {low:.3g} and {high:.3g} s",
-        {"low": low, "high": high, "sample_time": judged.data.rows.step},
+        {"low": low, "high": high, "sample_time": context.data.rows.step},
         "sample faster" if quick else
         "record longer, with several frequencies, in both directions and well above friction",
         ("time_constant", "time_constant_product"),
     )  # fmt: skip
 
 
-def _friction_dominates(judged: Judged) -> Iterator[Finding]:
-    static = judged.quantity("static_voltage")
-    if static is None or (static.value or 0.0) <= FRICTION_MOST * judged.top:
+def _check_friction(context: EstimateContext) -> Iterator[Finding]:
+    static, most = context.quantity("static_voltage"), context.largest_command
+    if static is None or (static.value or 0.0) <= FRICTION_MOST * most:
         return
     yield Finding(
         "friction_dominates", "unreliable",
-        f"friction takes {static.value:.3g} V of at most {judged.top:.3g} V; a driver that coasts "
+        f"friction takes {static.value:.3g} V of at most {most:.3g} V; a driver that coasts "
         "between its pulses, a dead zone or a jammed gear has the same effect",
-        {"static_voltage": static.value, "largest": judged.top},
+        {"static_voltage": static.value, "largest": most},
         "drive with more voltage, let the driver brake between its pulses (slow decay), or record "
         "the voltage at the terminals",
     )  # fmt: skip
 
 
-def _plausible(judged: Judged) -> Iterator[Finding]:
-    gain, lag = judged.quantity("dc_gain"), judged.quantity("time_constant")
-    static = judged.quantity("static_voltage")
+def _check_plausibility(context: EstimateContext) -> Iterator[Finding]:
+    gain, lag = context.quantity("dc_gain"), context.quantity("time_constant")
+    static = context.quantity("static_voltage")
     if gain is None or lag is None:
         return
     friction = 0.0 if static is None else float(static.value or 0.0)
-    yield from implausible_motor(
-        judged.group, float(gain.value or 0.0), float(lag.value or 0.0), friction
+    yield from check_plausibility(
+        context.group, float(gain.value or 0.0), float(lag.value or 0.0), friction
     )
 
 
-def _chain(judged: Judged) -> Iterator[Finding]:
+def _report_components(context: EstimateContext) -> Iterator[Finding]:
     """Name every component beyond the plain motor, with its size."""
-    for one in judged.found.chain.components:
-        if one.code in PLAIN:
+    for one in context.found.chain.components:
+        if one.code in UNREPORTED_COMPONENTS:
             continue
-        sizes = [text for p in one.parameters if (text := _size(judged, p))]
+        sizes = [text for p in one.parameters if (text := _describe_size(context, p))]
         article = "an" if one.title[0] in "aeiou" else "a"
         text = f"the recording shows {article} {one.title}" + (
             f": {', '.join(sizes)}" if sizes else ""
         )
         evidence: dict[str, float | str | None] = {
-            REPORTED.get(p.name, p.name): judged.found.chain.values[p.name] for p in one.parameters
+            REPORTED.get(p.name, p.name): context.found.chain.values[p.name] for p in one.parameters
         }
-        severity = one.severity if _significant(judged, one) else "note"
+        severity = one.severity if _is_significant(context, one) else "note"
         yield Finding(one.code, severity, text, evidence, one.advice)
 
 
-def _significant(judged: Judged, one: Component) -> bool:
+def _is_significant(context: EstimateContext, one: Component) -> bool:
     """Tell whether some parameter of a component differs from that without effect."""
     for p in one.parameters:
-        if p.name in judged.found.names:
-            k = judged.found.names.index(p.name)
-            variance = sum(float(part.covariance[k, k]) for part in judged.parts)
-            off = judged.found.chain.values[p.name] - p.neutral * judged.found.scales.of(p.unit)
-            if abs(off) > SIGNIFICANT * math.sqrt(variance):
+        if p.name in context.found.names:
+            k = context.found.names.index(p.name)
+            variance = sum(float(part.covariance[k, k]) for part in context.parts)
+            off = context.found.chain.values[p.name] - p.neutral * context.found.scales.of(p.unit)
+            if abs(off) > MIN_SIGNIFICANT_SIZE * math.sqrt(variance):
                 return True
-    return not any(p.name in judged.found.names for p in one.parameters)
+    return not any(p.name in context.found.names for p in one.parameters)
 
 
-def _size(judged: Judged, parameter: Parameter) -> str:
-    """Return a parameter of a component in words, with its deviation and unit."""
+def _describe_size(context: EstimateContext, parameter: Parameter) -> str:
+    """Describe a parameter of a component with its deviation and unit."""
     name = parameter.name
-    if name in UNTOLD or name not in judged.found.names:
+    if name in UNREPORTED_PARAMETERS or name not in context.found.names:
         return ""
-    reported = judged.quantity(REPORTED.get(name, ""))
+    reported = context.quantity(REPORTED.get(name, ""))
     if reported is not None:
         name, unit = REPORTED[name], UNITS[REPORTED[name]]
         value, std = reported.value or 0.0, reported.std or 0.0
     else:
-        k, unit = judged.found.names.index(name), parameter.unit
-        value = judged.found.chain.values[name]
-        std = math.sqrt(max(sum(float(p.covariance[k, k]) for p in judged.parts), 0.0))
+        k, unit = context.found.names.index(name), parameter.unit
+        value = context.found.chain.values[name]
+        std = math.sqrt(max(sum(float(p.covariance[k, k]) for p in context.parts), 0.0))
     shown = "" if unit == "1" else f" {unit}"
     return f"{name.replace('_', ' ')} {value:.3g} ± {std:.2g}{shown}"
 
 
-def _levels(judged: Judged) -> Iterator[Finding]:
-    levels = judged.levels
+def _report_levels(context: EstimateContext) -> Iterator[Finding]:
+    levels = context.levels
     if levels.steady:
-        speed = judged.quantity("steady_speed")
+        speed = context.quantity("steady_speed")
         if speed is not None:
             yield Finding(
                 "one_level", "warning",
@@ -301,7 +305,7 @@ def _levels(judged: Judged) -> Iterator[Finding]:
                 "record two levels of voltage, or a reversal",
             )  # fmt: skip
     elif levels.one_size:
-        gain = judged.answer.combinations.get("dc_gain")
+        gain = context.answer.combinations.get("dc_gain")
         shares = [s.share for s in gain.systematic if s.share] if gain is not None else []
         share = max(shares, default=0.0)
         yield Finding(
@@ -323,14 +327,14 @@ def _levels(judged: Judged) -> Iterator[Finding]:
         yield Finding(
             "one_direction", "warning",
             "the motor was driven in one direction: the static voltage includes a constant load",
-            {"voltage": levels.one_size or judged.top}, "drive both directions",
+            {"voltage": levels.one_size or context.largest_command}, "drive both directions",
         )  # fmt: skip
 
 
-def _driving_load(judged: Judged) -> Iterator[Finding]:
+def _report_driving_load(context: EstimateContext) -> Iterator[Finding]:
     """Report a load that drives the motor, found with one direction of motion."""
-    load, command = judged.quantity("load_voltage"), judged.data.rows.command
-    if not judged.levels.one_way or load is None or load.value is None:
+    load, command = context.quantity("load_voltage"), context.data.rows.command
+    if not context.levels.one_way or load is None or load.value is None:
         return
     way = math.copysign(1.0, command[int(np.argmax(np.abs(command)))])
     if way * load.value < -2 * (load.std or 0.0):
@@ -343,14 +347,14 @@ def _driving_load(judged: Judged) -> Iterator[Finding]:
         )  # fmt: skip
 
 
-def _current_offset(judged: Judged) -> Iterator[Finding]:
-    """Say which offset of the current's sensor was taken out."""
-    names, current = judged.found.names, judged.data.current
+def _report_current_offset(context: EstimateContext) -> Iterator[Finding]:
+    """Report the offset of the current sensor that was subtracted."""
+    names, current = context.found.names, context.data.current
     if current is None or "current_offset" not in names:
         return
-    offset = judged.found.chain.values["current_offset"]
+    offset = context.found.chain.values["current_offset"]
     k = names.index("current_offset")
-    std = math.sqrt(sum(p.covariance[k, k] for p in judged.parts))
+    std = math.sqrt(sum(p.covariance[k, k] for p in context.parts))
     if abs(offset) > max(4 * std, 0.01 * float(np.nanmax(np.abs(current)))):
         yield Finding(
             "current_offset", "note",
@@ -359,22 +363,24 @@ def _current_offset(judged: Judged) -> Iterator[Finding]:
         )  # fmt: skip
 
 
-def _current_scale(judged: Judged) -> Iterator[Finding]:
+def _report_current_scale(context: EstimateContext) -> Iterator[Finding]:
     """Report the effect of the current's scale, compared with an ohmmeter if given."""
     known = [
-        n for n in BY_CURRENT if (q := judged.quantity(n)) is not None and q.status == "estimated"
+        n
+        for n in SCALE_POWERS
+        if (q := context.quantity(n)) is not None and q.status == "estimated"
     ]
     if "resistance" not in known:
         return
-    ohmmeter = judged.group[0].hardware.resistance
-    found = judged.quantity("resistance")
+    ohmmeter = context.group[0].hardware.resistance
+    found = context.quantity("resistance")
     evidence: dict[str, float | str | None] = {"of_the_scale": ", ".join(known)}
     names = ", ".join(n.replace("_", " ") for n in known)
     text = f"{names} depend on the scale of the current sensor"
     if not ohmmeter or found is None or found.value is None:
         share = max((s.share or 0.0 for s in found.systematic if s.cause == "current_scale"),
                     default=0.0) if found else 0.0  # fmt: skip
-        one_size = judged.levels.one_size > 0
+        one_size = context.levels.one_size > 0
         if one_size:
             text += ", or with the duty cycle if it measures the supply"
         yield Finding(
@@ -396,9 +402,9 @@ def _current_scale(judged: Judged) -> Iterator[Finding]:
     )  # fmt: skip
 
 
-def _torque_noise(judged: Judged) -> Iterator[Finding]:
+def _report_torque_noise(context: EstimateContext) -> Iterator[Finding]:
     """Report a fluctuating load: coloured noise of the speed beyond the sensor's."""
-    acceleration = acceleration_noise(judged.data, judged.found)
+    acceleration = estimate_acceleration_noise(context.data, context.found)
     if acceleration <= 0:
         return
     yield Finding(
@@ -410,7 +416,7 @@ def _torque_noise(judged: Judged) -> Iterator[Finding]:
     )  # fmt: skip
 
 
-def acceleration_noise(data: Data, found: Fit) -> float:
+def estimate_acceleration_noise(data: Data, found: Fit) -> float:
     """Return the density of a fluctuating acceleration [rad/s^2 s^0.5], 0 where none shows.
 
     A speed that forgets within tau has the variance ``a^2 tau / 2`` of white acceleration a.
@@ -432,12 +438,12 @@ def acceleration_noise(data: Data, found: Fit) -> float:
     return math.sqrt(2 * variance / found.scales.lag)
 
 
-def _separable(judged: Judged) -> Iterator[Finding]:
-    missing = [n for n in PHYSICAL if judged.answer.parameters[n].status == "unidentifiable"]
+def _report_unidentified(context: EstimateContext) -> Iterator[Finding]:
+    missing = [n for n in PHYSICAL if context.answer.parameters[n].status == "unidentifiable"]
     if not missing:
         return
     names = ", ".join(n.replace("_", " ") for n in missing)
-    if judged.data.current is None:
+    if context.data.current is None:
         yield Finding(
             "not_separable", "note",
             f"voltage and speed alone cannot separate {names}: many motors respond alike",

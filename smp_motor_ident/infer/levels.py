@@ -9,13 +9,13 @@ import numpy as np
 
 from smp_motor_control.arrays import Array
 from smp_motor_ident.fit.data import Data
-from smp_motor_ident.fit.start import command_of
+from smp_motor_ident.fit.start import average_command
 from smp_motor_ident.limits import REST, SAME_LEVEL
 
 MIN_SWINGS = 6
-MANY_CHANGES = 0.2  # share of the rows: a command that changes in more of them makes no steps
+MAX_STEP_SHARE = 0.2  # of the rows, in which a command of steps changes
 
-COASTING = 0.2  # share of the largest speed from which a motor without voltage coasts
+MIN_COASTING_SPEED_SHARE = 0.2  # of the largest speed
 
 
 @dataclass(frozen=True)
@@ -28,25 +28,25 @@ class Levels:
     one_way: bool  # whether it drives in one direction only
 
 
-def levels_of(data: Data) -> Levels:
+def detect_levels(data: Data) -> Levels:
     """Return the levels of a recording's command."""
     command = data.rows.command
     one_way = not command.min() < 0 < command.max()
-    size = _only_size(command)
+    size = _find_only_size(command)
     steady = 0.0
-    if size and one_way and not _coasts(data):
+    if size and one_way and not _has_coasting(data):
         steady = float(command[np.argmax(np.abs(command))])
-    return Levels(size or _only_swing(data), _only_step(command), steady, one_way)
+    return Levels(size or _find_only_swing(data), _find_only_step(command), steady, one_way)
 
 
-def _coasts(data: Data) -> bool:
+def _has_coasting(data: Data) -> bool:
     """Tell whether the motor runs down without voltage, which shows its friction."""
-    speed, off = np.abs(data.speed), command_of(data.rows) == 0.0
-    fast = speed > COASTING * float(np.nanquantile(speed, 0.98))
+    speed, off = np.abs(data.speed), average_command(data.rows) == 0.0
+    fast = speed > MIN_COASTING_SPEED_SHARE * float(np.nanquantile(speed, 0.98))
     return int((off & fast).sum()) >= 3
 
 
-def _only_size(command: Array) -> float:
+def _find_only_size(command: Array) -> float:
     """Return the only size of a command besides zero; a row between two levels is no third."""
     top = float(np.abs(command).max())
     other = (top - np.abs(command) > SAME_LEVEL * top) & (np.abs(command) > REST * top)
@@ -56,7 +56,7 @@ def _only_size(command: Array) -> float:
     return 0.0 if other.any() else top
 
 
-def _only_swing(data: Data) -> float:
+def _find_only_swing(data: Data) -> float:
     """Return the peak of a command that swings there and back always as far and as long."""
     command, begin = data.rows.command, data.rows.begin
     turns = np.flatnonzero(np.diff(command >= 0)) + 1
@@ -71,10 +71,10 @@ def _only_swing(data: Data) -> float:
     return peak if float(alike.mean()) > 1 - SAME_LEVEL else 0.0
 
 
-def _only_step(command: Array) -> float:
+def _find_only_step(command: Array) -> float:
     change = np.abs(np.diff(command))
     steps = change[change > REST * float(np.abs(command).max())]
-    if not MIN_SWINGS <= steps.size < MANY_CHANGES * change.size:
+    if not MIN_SWINGS <= steps.size < MAX_STEP_SHARE * change.size:
         return 0.0
     size = float(np.median(steps))
     alike = np.abs(steps - size) < SAME_LEVEL * size

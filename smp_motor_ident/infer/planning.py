@@ -27,10 +27,10 @@ from smp_motor_ident.result import Estimate
 AMPLITUDES = (0.4, 0.7, 1.0)
 VISCOUS_SHARES = (0.03, 0.3, 0.7, 0.97)
 """Shares of a0 that viscous friction may be where the current was not measured."""
-LARGEST_RESISTANCE = 15.0  # [ohm] allowed for where it is not known either
-SPREADS = (0.5, 2.0, 6.0)
-TRIAL_LENGTH = 10.0  # [s]
-COARSE_ANGLE = 0.01  # standard deviation [rad] of an angle whose counts are not known
+MAX_RESISTANCE_OHM = 15.0  # assumed where it is not known either
+BAND_SPREADS = (0.5, 2.0, 6.0)
+TRIAL_LENGTH_S = 10.0
+UNKNOWN_ANGLE_STD = 0.01  # [rad], of an angle whose counts are not known
 
 
 @dataclass(frozen=True)
@@ -64,37 +64,39 @@ def what_next(
             f"{estimate.wheel}: neither the supply nor the voltage of the recording is known; "
             "give the largest voltage that the motor may get"
         )
-    family = _family(estimate)
+    family = _list_equivalent_motors(estimate)
     step = estimate.sample_time or 0.005
     corner = 1 / (2 * np.pi * max(estimate.value("time_constant"), 4 * step))
     needs_current = not estimate.model.startswith("electromechanical")
     best: Proposal | None = None
     for share in AMPLITUDES:
-        for spread in SPREADS:
+        for spread in BAND_SPREADS:
             band = (max(0.05, 0.1 * corner), min(corner * spread, 0.4 / step))
-            data = _trial(share * limit, band, step, estimate.hardware)
-            each = [_relative_std(data, chain, estimate, current_noise) for chain in family]
+            data = _make_trial(share * limit, band, step, estimate.hardware)
+            each = [_predict_relative_std(data, chain, estimate, current_noise) for chain in family]
             relative = {n: max(one[n] for one in each) for n in each[0]}
-            length = TRIAL_LENGTH * (max(relative.values()) / accuracy) ** 2
+            length = TRIAL_LENGTH_S * (max(relative.values()) / accuracy) ** 2
             duration = float(np.clip(length, 5.0, longest))
-            after = {n: v * float(np.sqrt(TRIAL_LENGTH / duration)) for n, v in relative.items()}
-            words = _words(share * limit, band, duration, needs_current, after, accuracy)
+            after = {n: v * float(np.sqrt(TRIAL_LENGTH_S / duration)) for n, v in relative.items()}
+            words = _describe_proposal(
+                share * limit, band, duration, needs_current, after, accuracy
+            )
             made = Proposal(share * limit, band, duration, after, words)
-            if best is None or _cost(made, accuracy) < _cost(best, accuracy):
+            if best is None or _rank_proposal(made, accuracy) < _rank_proposal(best, accuracy):
                 best = made
     assert best is not None
     return best
 
 
-def _cost(p: Proposal, accuracy: float) -> tuple[float, float, float]:
+def _rank_proposal(p: Proposal, accuracy: float) -> tuple[float, float, float]:
     # A length that suffices misses by rounding only, which must not choose.
     excess = round(max(0.0, max(p.relative_std.values()) / accuracy - 1.0), 9)
     return excess, p.duration, p.amplitude
 
 
-def _family(estimate: Estimate) -> list[Chain]:
+def _list_equivalent_motors(estimate: Estimate) -> list[Chain]:
     """Return the motors with the same response as the estimated one."""
-    resistance = estimate.value("resistance") or estimate.hardware.resistance or LARGEST_RESISTANCE
+    resistance = estimate.value("resistance") or estimate.hardware.resistance or MAX_RESISTANCE_OHM
     gain, lag = estimate.value("dc_gain"), estimate.value("time_constant")
     product = estimate.value("time_constant_product") or 0.02 * lag**2
     values = {
@@ -107,8 +109,10 @@ def _family(estimate: Estimate) -> list[Chain]:
     return [Chain(made, {**values, "viscous": share}) for share in shares]
 
 
-def _trial(amplitude: float, band: tuple[float, float], step: float, hardware: Hardware) -> Data:
-    t = np.arange(int(TRIAL_LENGTH / step), dtype=np.float64) * step
+def _make_trial(
+    amplitude: float, band: tuple[float, float], step: float, hardware: Hardware
+) -> Data:
+    t = np.arange(int(TRIAL_LENGTH_S / step), dtype=np.float64) * step
     tones = np.geomspace(*band, 16) * (1 + 0.013 * np.sin(np.arange(16) * 2.399))
     phases = np.pi * np.arange(16) ** 2 / 16
     v = np.cos(2 * np.pi * np.outer(t, tones) + phases).sum(axis=1)
@@ -116,16 +120,16 @@ def _trial(amplitude: float, band: tuple[float, float], step: float, hardware: H
     still = np.zeros(len(t))
     record = Record("trial", t, v, still, None, still, hardware=hardware)
     data = prepare([record], True)
-    return replace(data, stood=np.ones(1, dtype=np.bool_))
+    return replace(data, starts_at_rest=np.ones(1, dtype=np.bool_))
 
 
-def _relative_std(
+def _predict_relative_std(
     data: Data, chain: Chain, estimate: Estimate, current_noise: float
 ) -> dict[str, float]:
     """Return the relative standard deviation of every physical parameter after a trial."""
     turn = estimate.hardware.counts_per_revolution
     noise = (
-        Noise.white(2 * np.pi / turn / np.sqrt(12) if turn else COARSE_ANGLE),
+        Noise.white(2 * np.pi / turn / np.sqrt(12) if turn else UNKNOWN_ANGLE_STD),
         Noise.white(current_noise),
     )
     scales = data.scales(estimate.value("time_constant"))
@@ -145,7 +149,7 @@ def _relative_std(
     return out
 
 
-def _words(
+def _describe_proposal(
     amplitude: float,
     band: tuple[float, float],
     duration: float,

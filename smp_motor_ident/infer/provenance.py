@@ -7,57 +7,57 @@ from typing import Any
 
 import numpy as np
 
-from smp_motor_ident.infer.findings import Judged
-from smp_motor_ident.quality.differenced import rounding
+from smp_motor_ident.infer.findings import EstimateContext
+from smp_motor_ident.quality.differenced import read_count_rounding
 from smp_motor_ident.quality.resolution import speed_quantum
 from smp_motor_ident.result import Candidate
 
 
-def provenance(judged: Judged) -> dict[str, Any]:
-    """Return the fields of an `Estimate` that are of its records and its model."""
-    group, data = judged.group, judged.data
+def describe_provenance(context: EstimateContext) -> dict[str, Any]:
+    """Describe the records and the model of an `Estimate`, field by field."""
+    group, data = context.group, context.data
     return {
         "wheel": group[0].wheel,
-        "model": model_name(judged),
+        "model": name_model(context),
         "duration": float(sum(r.duration for r in group)),
         "largest_voltage": max(float(np.abs(r.voltage).max()) for r in group),
         "sources": tuple(dict.fromkeys(r.source for r in group if r.source)),
         "hardware": group[0].hardware,
         "samples": len(data),
         "sample_time": data.rows.step,
-        "speed_noise": 0.0 if data.is_angle else float(judged.found.noise[0].deviation[-1]),
-        "speed_step": _speed_step(judged),
-        "angle_noise": _angle_noise(judged),
+        "speed_noise": 0.0 if data.is_angle else float(context.found.noise[0].deviation[-1]),
+        "speed_step": _find_speed_step(context),
+        "angle_noise": _find_angle_noise(context),
     }
 
 
-def model_name(judged: Judged) -> str:
+def name_model(context: EstimateContext) -> str:
     """Return the structure of the motor that the data determine."""
-    if judged.data.current is not None:
+    if context.data.current is not None:
         return "electromechanical"
-    if judged.quantity("time_constant") is None:
+    if context.quantity("time_constant") is None:
         return "static_gain"
-    return "first_order" if judged.quantity("time_constant_product") is None else "second_order"
+    return "first_order" if context.quantity("time_constant_product") is None else "second_order"
 
 
-def candidates_of(judged: Judged) -> tuple[Candidate, ...]:
+def describe_candidates(context: EstimateContext) -> tuple[Candidate, ...]:
     """Return the chosen chain."""
-    chosen = " + ".join(judged.found.chain.codes)
-    return (Candidate(chosen, judged.percent.estimation, judged.found.deviance, True),)
+    chosen = " + ".join(context.found.chain.codes)
+    return (Candidate(chosen, context.percent.estimation, context.found.deviance, True),)
 
 
-def _speed_step(judged: Judged) -> float:
+def _find_speed_step(context: EstimateContext) -> float:
     """Return the largest step in which a recorded speed comes [rad/s]."""
-    if judged.data.is_angle:
+    if context.data.is_angle:
         return 0.0
-    speeds = [r.velocity for r in judged.group if r.velocity is not None]
+    speeds = [r.velocity for r in context.group if r.velocity is not None]
     return max(map(speed_quantum, speeds), default=0.0)
 
 
-def _angle_noise(judged: Judged) -> float:
+def _find_angle_noise(context: EstimateContext) -> float:
     """Return the noise of a recorded angle [rad], 0 where counts or a speed were recorded."""
-    group = judged.group
+    group = context.group
     counted = any(r.count is not None and r.hardware.counts_per_revolution for r in group)
-    if not judged.data.is_angle or counted:
+    if not context.data.is_angle or counted:
         return 0.0
-    return max(map(rounding, group)) or float(judged.found.noise[0].deviation[-1])
+    return max(map(read_count_rounding, group)) or float(context.found.noise[0].deviation[-1])

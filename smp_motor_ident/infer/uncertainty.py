@@ -20,26 +20,26 @@ from smp_motor_ident.chain.chain import Chain
 from smp_motor_ident.chain.component import Component
 from smp_motor_ident.chain.motor import Delay, Friction
 from smp_motor_ident.chain.quantities import REPORTED
-from smp_motor_ident.fit.adequacy import scatters
-from smp_motor_ident.fit.data import SEARCH_ROWS, Data
-from smp_motor_ident.fit.descend import Fit, restate
+from smp_motor_ident.fit.adequacy import compute_scatters
+from smp_motor_ident.fit.data import MIN_SEARCH_ROWS, Data
+from smp_motor_ident.fit.descend import Fit, evaluate_on_rows
 from smp_motor_ident.fit.search import (
     SelectionPolicy,
-    candidates,
+    compute_relative_prior_std,
     fit_roughly,
-    relabelled,
-    typical_size,
+    list_candidates,
+    replace_second_lag,
 )
 from smp_motor_ident.infer.levels import Levels
 from smp_motor_ident.limits import TIMING_ACCURACY
 
-SUPPORTED = 0.1  # probability from which a component is part of the random uncertainty
-KNOWN = 100.0  # squared ratio of prior and posterior width from which the data show a size
+MIN_SUPPORTED_PROBABILITY = 0.1  # of a component in the random uncertainty
+MIN_SHOWN_VARIANCE_RATIO = 100.0  # prior over posterior variance of a size that the data show
 
 DRIVER_SLOTS = (
     "dead_zone", "clip", "sag", "drop", "current_limit", "decay", "free", "slew", "drag",
 )  # fmt: skip
-"""Slots whose components take a part of the voltage that depends on its size."""
+"""Slots of components that take a share of the voltage that depends on its size."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,34 +48,34 @@ class Contribution:
 
     name: str
     covariance: Array
-    unseen: Array | None = None  # shape (p,): systematic change by one standard deviation of it
-    adds: Mapping[str, float] = field(default_factory=dict)  # to quantities that the chain lacks
+    systematic_shift: Array | None = None  # shape (p,): change by one standard deviation
+    adds: Mapping[str, float] = field(default_factory=dict)  # shifts of absent quantities
 
 
-def contributions(
+def collect_contributions(
     data: Data, found: Fit, levels: Levels, timing: float | None = None
 ) -> list[Contribution]:
-    """Return all parts of the uncertainty; their sum does not depend on their order.
+    """Collect all parts of the uncertainty; their sum does not depend on their order.
 
     ``timing``: accuracy of the instants of the readings [s].
     """
-    parts = [*of_noise(found), *of_priors(found), *of_thresholds(data, found)]
+    parts = [*assess_noise(found), *assess_priors(found), *assess_thresholds(data, found)]
     if levels.steady and "vc" in found.names:
-        parts.append(of_one_level(found))
-    for one in scatters(data, found):
+        parts.append(assess_one_level(found))
+    for one in compute_scatters(data, found):
         if one.significant:
             parts.append(Contribution(one.name, one.excess))
-    some = data.thinned(SEARCH_ROWS)
-    seen = found if some is data else restate(some, found)
+    some = data.thin(MIN_SEARCH_ROWS)
+    seen = found if some is data else evaluate_on_rows(some, found)
     share = seen.linear.row.size / found.linear.row.size
-    parts += considered(some, seen, bool(levels.one_size), 1 / share)
-    parts += of_relabelled(some, seen)
+    parts += assess_absent_components(some, seen, bool(levels.one_size), 1 / share)
+    parts += assess_second_lag_alternatives(some, seen)
     seconds = TIMING_ACCURACY * data.sample if timing is None else timing
-    parts += of_timing(some, seen, seconds)
+    parts += assess_timing(some, seen, seconds)
     return parts
 
 
-def of_noise(found: Fit) -> list[Contribution]:
+def assess_noise(found: Fit) -> list[Contribution]:
     """Return the covariance between repeated recordings."""
     m = found.linear.row.size
     columns = found.linear.columns[:m]
@@ -83,7 +83,7 @@ def of_noise(found: Fit) -> list[Contribution]:
     return [Contribution("noise", half @ half.T)]
 
 
-def of_priors(found: Fit) -> list[Contribution]:
+def assess_priors(found: Fit) -> list[Contribution]:
     """Return the contribution of the priors on motors.
 
     Together with the noise of the data it is the whole covariance of the fit.
@@ -94,16 +94,13 @@ def of_priors(found: Fit) -> list[Contribution]:
     thresholds = [p.name for p in found.chain.free if p.threshold]
     return [
         Contribution(name, nothing, shift)
-        for name, shift in zip(found.priors, shifts, strict=True)
+        for name, shift in zip(found.prior_causes, shifts, strict=True)
         if name not in thresholds
     ]
 
 
-def of_thresholds(data: Data, found: Fit) -> Iterator[Contribution]:
-    """Yield where a size of command that the driver tells from smaller ones may lie.
-
-    It is anywhere between two commands of the recording, as the estimate is.
-    """
+def assess_thresholds(data: Data, found: Fit) -> Iterator[Contribution]:
+    """Yield the uncertainty of thresholds between two commands of the recording."""
     size = np.sort(np.abs(data.rows.command))
     for k, parameter in enumerate(found.chain.free):
         if parameter.threshold:
@@ -114,21 +111,21 @@ def of_thresholds(data: Data, found: Fit) -> Iterator[Contribution]:
             yield Contribution(parameter.name, covariance)
 
 
-def of_one_level(found: Fit) -> Contribution:
+def assess_one_level(found: Fit) -> Contribution:
     """Return the contribution of typical friction in a recording with one level of voltage.
 
     Only the instant of breaking away shows friction then, and a delay shifts it.
     """
     k = found.names.index("vc")
-    (_, _, deviation) = Friction().expected(found.scales)[0]
+    (_, _, deviation) = Friction().list_priors(found.scales)[0]
     shift = found.covariance[:, k] / found.covariance[k, k]
     return Contribution("vc", np.zeros_like(found.covariance), shift * deviation)
 
 
-def of_timing(data: Data, found: Fit, seconds: float) -> list[Contribution]:
-    """Return what changes if the readings were taken so much later than their stamps say.
+def assess_timing(data: Data, found: Fit, seconds: float) -> list[Contribution]:
+    """Return the change of the parameters if readings are later than their stamps.
 
-    A delay that is part of the chain takes that up.
+    A delay in the chain absorbs it.
     """
     if found.chain.has("delay"):
         return []
@@ -142,13 +139,13 @@ def of_timing(data: Data, found: Fit, seconds: float) -> list[Contribution]:
     return [Contribution("timing", np.zeros_like(found.covariance), -shift * seconds / late)]
 
 
-def of_relabelled(data: Data, found: Fit) -> Iterator[Contribution]:
-    """Yield what changes if another component stands for the motor's second lag.
+def assess_second_lag_alternatives(data: Data, found: Fit) -> Iterator[Contribution]:
+    """Yield the change of the parameters if another component replaces the second lag.
 
-    Both explain the data nearly alike, far apart, so that no derivative tells.  The likelihoods,
-    and the priors of both, tell how probable the other is.
+    Both fit nearly alike with distant parameters, so derivatives do not show it.  The other is
+    weighted by its prior and by the ratio of the likelihoods.
     """
-    for one, chain in relabelled(found, data):
+    for one, chain in replace_second_lag(found, data):
         other = fit_roughly(data, chain, found)
         odds = one.prior / (1 - one.prior)
         odds *= math.exp(min(0.5 * (found.linear.cost - other.linear.cost), 50.0))
@@ -166,10 +163,10 @@ def of_relabelled(data: Data, found: Fit) -> Iterator[Contribution]:
         yield Contribution(one.code, nothing, weight * np.array(changes), adds)
 
 
-def considered(
+def assess_absent_components(
     data: Data, found: Fit, one_size: bool = False, rows: float = 1.0
 ) -> list[Contribution]:
-    """Return what each absent component would change, weighted by how probable it is.
+    """Return the bias by each absent component, weighted by the probability of its presence.
 
     A component of size s moves the parameters by ``g s``.  The data put s at ``m`` with variance v,
     of a prior of variance t^2; it is there with the probability w that follows from the prior odds
@@ -178,18 +175,18 @@ def considered(
     systematic: it changes the gain, and only details of transients would show it.  ``rows``: rows
     of the recording for each row of the data.
     """
-    policy = replace(SelectionPolicy(), extra=0.0)
+    policy = replace(SelectionPolicy(), extra_price=0.0)
     best: dict[str, tuple[float, float, Contribution]] = {}
-    for one, chain in candidates(found, data):
+    for one, chain in list_candidates(found, data):
         hidden = one_size and one.slot in DRIVER_SLOTS
-        part = _considered(one, chain, data, found, policy, rows, hidden)
-        small = typical_size(one, chain, found) if one.linear else 0.0
+        part = _assess_absent_component(one, chain, data, found, policy, rows, hidden)
+        small = compute_relative_prior_std(one, chain, found) if one.linear else 0.0
         if part is not None and (one.code not in best or (small, part[0]) > best[one.code][:2]):
             best[one.code] = small, *part
     return [part for *_, part in best.values()]
 
 
-def _considered(
+def _assess_absent_component(
     one: Component,
     chain: Chain,
     data: Data,
@@ -206,29 +203,29 @@ def _considered(
     columns = found.linear.columns
     shift = found.covariance @ (columns.T @ signature)  # of the parameters, for this size
     rest = signature - columns @ shift
-    energy = float(rest @ rest)  # of the rows that are looked at
-    unit = typical_size(one, chain, found)
-    information = rows * energy * unit**2
+    energy = float(rest @ rest)  # of these rows
+    unit = compute_relative_prior_std(one, chain, found)
+    variance_ratio = rows * energy * unit**2
     optimum = -float(rest @ base) / energy if energy > 0 else 0.0
     variance = 1 / (rows * energy + 1 / unit**2)
     size = optimum * energy / (energy + 1 / unit**2)
-    if rows > 1.0:  # chance of fewer rows is no size
+    if rows > 1.0:  # chance in fewer rows
         size = math.sqrt(max(size**2 - 1 / (energy + 1 / unit**2), 0.0))
     gain = optimum**2 * energy
-    if _one_sided(one) and optimum < 0:
+    if _is_one_sided(one) and optimum < 0:
         gain, size = 0.0, 0.0
-    price = policy.price(one, information)
+    price = policy.price(one, variance_ratio)
     weight = 1 / (1 + math.exp(min(max(0.5 * (price - gain), -50.0), 50.0)))
-    shown = information**2 / (KNOWN**2 + information**2)  # share of the size that the data show
+    shown = variance_ratio**2 / (MIN_SHOWN_VARIANCE_RATIO**2 + variance_ratio**2)
     spread = weight * shown * (size**2 + variance)
-    unseen = (1 - shown) * unit**2
-    if hidden or weight < SUPPORTED:  # the record does not speak for it, nor quite against it
-        spread, unseen = 0.0, unseen + spread
+    hidden_variance = (1 - shown) * unit**2
+    if hidden or weight < MIN_SUPPORTED_PROBABILITY:  # neither supported nor excluded
+        spread, hidden_variance = 0.0, hidden_variance + spread
     return weight, Contribution(
-        one.code, spread * np.outer(shift, shift), shift * math.sqrt(unseen)
+        one.code, spread * np.outer(shift, shift), shift * math.sqrt(hidden_variance)
     )
 
 
-def _one_sided(one: Component) -> bool:
+def _is_one_sided(one: Component) -> bool:
     first = one.parameters[0] if one.parameters else None
     return first is not None and (first.low >= first.neutral or first.high <= first.neutral)

@@ -46,13 +46,13 @@ from smp_motor_ident.limits import (
 )
 from smp_motor_ident.result import ModelError
 
-HANN = 1 + 2 * (2 / 3) ** 2 + 2 * (1 / 6) ** 2
+HANN_LINES = 1 + 2 * (2 / 3) ** 2 + 2 * (1 / 6) ** 2
 """Lines under a Hann window that equal one independent line: neighbours correlate by 2/3, the next
 by 1/6."""
 
-ROUNDING = 1e-14  # share of a sum of squares that rounding leaves
+ROUNDING_SHARE = 1e-14  # of a sum of squares
 
-FIRST = 2  # lines from 0 that the window fills with the mean
+FIRST_LINE = 2  # the window spreads the mean over those below
 
 
 def estimate_model_error(
@@ -65,17 +65,17 @@ def estimate_model_error(
     responses to the voltage with friction and without, ``step`` [s] is the interval of rows.
     """
     lines = [
-        _spectra(error[a:b], [one[a:b] for one in outputs], is_angle, step)
+        _compute_spectra(error[a:b], [one[a:b] for one in outputs], is_angle, step)
         for a, b in pairwise(segment)
-        if np.isfinite(error[a:b]).sum() > 2 * BAND_LINES + FIRST
+        if np.isfinite(error[a:b]).sum() > 2 * BAND_LINES + FIRST_LINE
     ]
     if not lines:
         return None
     omega, of_error, *moved = (np.concatenate(x) for x in zip(*lines, strict=True))
-    return relative_error(omega, of_error, np.array(moved))
+    return compute_relative_error(omega, of_error, np.array(moved))
 
 
-def _spectra(
+def _compute_spectra(
     error: Array, outputs: Sequence[Array], is_angle: bool, step: float
 ) -> tuple[Any, ...]:
     """Return frequencies, and the spectra of error and outputs of one segment."""
@@ -86,12 +86,14 @@ def _spectra(
     if is_angle:
         signals = np.diff(signals)
     window = np.hanning(signals.shape[1] + 2)[1:-1]
-    spectra = np.fft.rfft(window * (signals - signals.mean(axis=1, keepdims=True)))[:, FIRST:]
-    omega = 2 * np.pi * np.arange(FIRST, FIRST + spectra.shape[1]) / (signals.shape[1] * step)
+    spectra = np.fft.rfft(window * (signals - signals.mean(axis=1, keepdims=True)))[:, FIRST_LINE:]
+    omega = (
+        2 * np.pi * np.arange(FIRST_LINE, FIRST_LINE + spectra.shape[1]) / (signals.shape[1] * step)
+    )
     return omega, *spectra
 
 
-def relative_error(omega: Array, error: Complex, output: Complex) -> ModelError | None:
+def compute_relative_error(omega: Array, error: Complex, output: Complex) -> ModelError | None:
     """Return the relative error of a response from lines of spectra, in any order.
 
     Of several outputs, rows of ``output``, each band takes the one that is moved least, but where
@@ -100,69 +102,69 @@ def relative_error(omega: Array, error: Complex, output: Complex) -> ModelError 
     order = np.argsort(omega, kind="stable")
     omega, error, outputs = omega[order], error[order], np.atleast_2d(output)[:, order]
     found = []
-    for a, b in _bands(omega):
-        moved = outputs[np.argsort(_power(outputs[:, a:b])), a:b]
+    for a, b in _divide_into_bands(omega):
+        moved = outputs[np.argsort(_sum_squares(outputs[:, a:b])), a:b]
         if moved[0].any():
             middle = float(np.sqrt(omega[a] * omega[b - 1]))
-            filters = _filters(omega[a:b])
-            stated = [_most_shown(error[a:b], one * filters) for one in moved]
-            most = max(stated, key=_lower_limit)
-            found.append((middle, *(most if _lower_limit(most) > 1 else stated[0])))
+            filters = _list_trial_responses(omega[a:b])
+            stated = [_find_surest_error(error[a:b], one * filters) for one in moved]
+            most = max(stated, key=_compute_lower_limit)
+            found.append((middle, *(most if _compute_lower_limit(most) > 1 else stated[0])))
     if not found:
         return None
     frequency, shown, radius = zip(*found, strict=True)
     return ModelError(frequency, shown, tuple(s + r for s, r in zip(shown, radius, strict=True)))
 
 
-def _filters(omega: Array) -> Complex:
+def _list_trial_responses(omega: Array) -> Complex:
     """Return trial responses of a band as rows: unity, and resonances."""
     span = float(np.log(omega[-1] / omega[0]))
     n = max(round(span / (2 * RESONANCE_DAMPING)), 1)
     at = omega[0] * np.exp(span * (np.arange(n)[:, None] + 0.5) / n)
-    return np.vstack([np.ones(omega.size), _resonance(omega, at)])
+    return np.vstack([np.ones(omega.size), _compute_resonance(omega, at)])
 
 
-def _most_shown(error: Complex, outputs: Complex) -> tuple[float, float]:
+def _find_surest_error(error: Complex, outputs: Complex) -> tuple[float, float]:
     """Return size and radius of a band's error: of its mean, or of a resonance's peak."""
     n = len(outputs) - 1
-    size, radius = _circles(error, outputs, BAND_LEVEL / np.array([1, *[n] * n]))
+    size, radius = _compute_error_circles(error, outputs, BAND_LEVEL / np.array([1, *[n] * n]))
     surely = size - radius
     most = 1 + int(np.argmax(surely[1:]))
     most = most if surely[most] > max(surely[0], 0.0) else 0
     return float(size[most]), float(radius[most])
 
 
-def _lower_limit(stated: tuple[float, float]) -> float:
+def _compute_lower_limit(stated: tuple[float, float]) -> float:
     """Return the lower limit of an error from its size and radius."""
     return stated[0] - stated[1]
 
 
-def _circles(error: Complex, outputs: Complex, level: Array) -> tuple[Array, Array]:
+def _compute_error_circles(error: Complex, outputs: Complex, level: Array) -> tuple[Array, Array]:
     """Return the sizes of an error relative to outputs, one a row, and the radii of its circles."""
-    power, m = _power(outputs), error.size / HANN
+    power, m = _sum_squares(outputs), error.size / HANN_LINES
     size = np.abs(outputs.conj() @ error) / power
     # Residual of the projection, at least its rounding error
-    whole = _power(error)
-    rest = np.maximum(whole - size**2 * power, ROUNDING * whole) / HANN / (m - 1)
+    whole = _sum_squares(error)
+    rest = np.maximum(whole - size**2 * power, ROUNDING_SHARE * whole) / HANN_LINES / (m - 1)
     # Quantile of the F distribution with 2 and 2 (m - 1) degrees of freedom
     ratio = (m - 1) * (level ** (-1 / (m - 1)) - 1)
-    return size, np.sqrt(ratio * rest * HANN / power)
+    return size, np.sqrt(ratio * rest * HANN_LINES / power)
 
 
-def _power(rows: Complex) -> Array:
+def _sum_squares(rows: Complex) -> Array:
     """Return the sums of squares of rows."""
     parts = np.ascontiguousarray(rows).view(np.float64)
     return np.asarray(np.einsum("...i,...i->...", parts, parts))
 
 
-def _resonance(omega: Array, at: Array) -> Complex:
+def _compute_resonance(omega: Array, at: Array) -> Complex:
     """Return the response of a resonance, 1 at its peak."""
     width = 2j * RESONANCE_DAMPING * at * omega
     response: Complex = width / (at**2 - omega**2 + width)
     return response
 
 
-def _bands(omega: Array) -> Iterator[tuple[int, int]]:
+def _divide_into_bands(omega: Array) -> Iterator[tuple[int, int]]:
     """Yield the first and the one after the last line of each band."""
     begin, least = 0, int(BAND_LINES)
     while begin + least <= omega.size:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How much of the motion a chain explains, in data that it was fitted to and in others."""
+"""Share of the motion that a chain explains, in fitted and in held-out data."""
 
 from __future__ import annotations
 
@@ -9,24 +9,24 @@ from dataclasses import replace
 import numpy as np
 
 from smp_motor_control.arrays import Array, Integers
-from smp_motor_ident.chain.catalogue import chain_from
+from smp_motor_ident.chain.catalogue import rebuild_chain
 from smp_motor_ident.chain.chain import Chain
 from smp_motor_ident.chain.component import Scales
 from smp_motor_ident.chain.motor import Load
 from smp_motor_ident.chain.sensor import Angle, Speed
 from smp_motor_ident.fit.data import Data, prepare
-from smp_motor_ident.fit.descend import Fit, descend, settle
+from smp_motor_ident.fit.descend import Fit, descend, simulate_freely
 from smp_motor_ident.fit.noise import Noise
-from smp_motor_ident.fit.start import filled
+from smp_motor_ident.fit.start import hold_last_value
 from smp_motor_ident.record import Record
 from smp_motor_ident.result import Estimate, FitPercent
 
-COARSE = 0.02  # share of the speed's scatter that differences of a coarse angle may add to it
+MAX_COARSE_NOISE_SHARE = 0.02  # of the speed's scatter, by the rounding of an angle
 FITTED_SHARE = 0.7
-MIN_ROWS = 25
+MIN_PART_ROWS = 25
 
 
-def percent(measured: Array, predicted: Array, scatter: float = 0.0) -> float:
+def compute_fit_percent(measured: Array, predicted: Array, scatter: float = 0.0) -> float:
     """Return the normalised fit ``100 (1 - |y - yhat| / |y - mean y|)``, NaN if undefined.
 
     With ``scatter`` [rad/s] the root mean square of the error is compared with that instead.
@@ -39,41 +39,41 @@ def percent(measured: Array, predicted: Array, scatter: float = 0.0) -> float:
     return float(100 * (1 - np.sqrt(np.square(y - z).mean()) / scatter))
 
 
-def speeds(data: Data, simulated: Array) -> tuple[Array, Array]:
+def compare_speeds(data: Data, simulated: Array) -> tuple[Array, Array]:
     """Return measured and simulated speed [rad/s] of a simulated motion.
 
     Of an angle both are means over so many rows that its resolution adds little.
     """
     if not data.is_angle:
         return data.motion, simulated
-    time, motion = data.rows.time, filled(data.motion, data.rows.segment)
+    time, motion = data.rows.time, hold_last_value(data.motion, data.rows.segment)
     lag = 1
-    noise = np.sqrt(2) * max(data.quantum / np.sqrt(12), _roughness(motion))
-    scatter = float(np.nanstd(_means(time, data.rows.segment, simulated, 1)))
-    while noise / (lag * data.rows.step) > COARSE * scatter and 8 * lag < time.size:
-        longer = _means(time, data.rows.segment, simulated, 2 * lag)
+    noise = np.sqrt(2) * max(data.quantum / np.sqrt(12), _estimate_white_std(motion))
+    scatter = float(np.nanstd(_difference_angle(time, data.rows.segment, simulated, 1)))
+    while noise / (lag * data.rows.step) > MAX_COARSE_NOISE_SHARE * scatter and 8 * lag < time.size:
+        longer = _difference_angle(time, data.rows.segment, simulated, 2 * lag)
         if np.isnan(longer).all() or np.nanstd(longer) < 0.7 * scatter:
             break
         lag *= 2
     return (
-        _means(time, data.rows.segment, motion, lag),
-        _means(time, data.rows.segment, simulated, lag),
+        _difference_angle(time, data.rows.segment, motion, lag),
+        _difference_angle(time, data.rows.segment, simulated, lag),
     )
 
 
-def _roughness(angle: Array) -> float:
+def _estimate_white_std(angle: Array) -> float:
     """Return the standard deviation of the white part of an angle, by fourth differences."""
     y = angle[np.isfinite(angle)]
     return float(np.std(np.diff(y, n=4)) / np.sqrt(70)) if y.size > 8 else 0.0
 
 
-def white_share(data: Data) -> float:
+def estimate_white_share(data: Data) -> float:
     """Return the share of white noise in the scatter of the motion."""
     scatter = float(np.nanstd(data.motion))
-    return _roughness(data.motion) / scatter if scatter > 0 else 1.0
+    return _estimate_white_std(data.motion) / scatter if scatter > 0 else 1.0
 
 
-def _means(time: Array, segment: Integers, angle: Array, lag: int) -> Array:
+def _difference_angle(time: Array, segment: Integers, angle: Array, lag: int) -> Array:
     speed = np.full(time.size, np.nan)
     speed[lag:] = (angle[lag:] - angle[:-lag]) / (time[lag:] - time[:-lag])
     for first in segment[:-1]:
@@ -81,42 +81,44 @@ def _means(time: Array, segment: Integers, angle: Array, lag: int) -> Array:
     return speed
 
 
-def explained(data: Data, simulated: Array) -> float:
+def compute_explained_percent(data: Data, simulated: Array) -> float:
     """Return the fit percent of the speed without its white noise."""
-    measured, predicted = speeds(data, simulated)
+    measured, predicted = compare_speeds(data, simulated)
     error = (measured - predicted)[np.isfinite(measured - predicted)]
-    white = _roughness(error) ** 2
+    white = _estimate_white_std(error) ** 2
     moved = float(np.nanvar(measured)) - white
     left = max(float(np.square(error).mean()) - white, 0.0)
     return 100 * (1 - float(np.sqrt(left / moved))) if moved > 0 else 0.0
 
 
-def fit_percents(
-    group: Sequence[Record], data: Data, found: Fit, kept: Sequence[Record] | None
+def compute_fit_percents(
+    group: Sequence[Record], data: Data, found: Fit, held_out: Sequence[Record] | None
 ) -> FitPercent:
     """Return the fit of the data, and of records or a last part that were held out."""
-    own = percent(*speeds(data, found.motion))
-    held = _held_out(group, data, found, kept)
+    own = compute_fit_percent(*compare_speeds(data, found.motion))
+    held = _compute_holdout_fit(group, data, found, held_out)
     return FitPercent(*(float(x) if np.isfinite(x) else None for x in (own, held)))
 
 
-def _held_out(
-    group: Sequence[Record], data: Data, found: Fit, kept: Sequence[Record] | None
+def _compute_holdout_fit(
+    group: Sequence[Record], data: Data, found: Fit, held_out: Sequence[Record] | None
 ) -> float:
-    if kept is None and len(group) < 3:
-        return _fit_of_end(group, data, found)
+    if held_out is None and len(group) < 3:
+        return _compute_end_fit(group, data, found)
     chain = found.chain
-    if kept is None:
-        fitted, kept = split(group)
+    if held_out is None:
+        fitted, held_out = split_holdout(group)
         part = prepare(fitted, data.current is not None)
-        chain = descend(part, chain, found.scales, part.initial, found.noise, most=12).chain
-    judged = prepare(kept, False)
-    if judged.is_angle != data.is_angle or not any(np.ptp(r.voltage) for r in kept):
+        chain = descend(part, chain, found.scales, part.initial, found.noise, max_steps=12).chain
+    judged = prepare(held_out, False)
+    if judged.is_angle != data.is_angle or not any(np.ptp(r.voltage) for r in held_out):
         return float("nan")
-    return percent(*speeds(judged, _under_its_load(judged, chain, found.scales)))
+    return compute_fit_percent(
+        *compare_speeds(judged, _simulate_under_fitted_load(judged, chain, found.scales))
+    )
 
 
-def _under_its_load(data: Data, chain: Chain, scales: Scales) -> Array:
+def _simulate_under_fitted_load(data: Data, chain: Chain, scales: Scales) -> Array:
     """Return the motion simulated freely, its initial states and its constant load fitted."""
     chain = chain.without_slot("current sensor")
     if not chain.has("load"):
@@ -125,15 +127,15 @@ def _under_its_load(data: Data, chain: Chain, scales: Scales) -> Array:
     motion = replace(data, current=None)
     noise = [Noise.white(1e-3 * float(np.nanstd(data.motion)) or 1.0)]
     chain = replace(chain, fixed=others, constraints=())
-    return descend(motion, chain, scales, data.initial, noise, most=12).motion
+    return descend(motion, chain, scales, data.initial, noise, max_steps=12).motion
 
 
-def _fit_of_end(group: Sequence[Record], data: Data, found: Fit) -> float:
+def _compute_end_fit(group: Sequence[Record], data: Data, found: Fit) -> float:
     """Return the fit of the last part of every record to a chain that was fitted to the rest."""
     held = np.zeros(len(data), dtype=np.bool_)
     at = 0
     for record in group:
-        cut = cut_of(record)
+        cut = find_holdout_start(record)
         held[at + cut : at + len(record)] = True
         at += len(record)
     voltage = np.concatenate([r.voltage for r in group])
@@ -144,29 +146,31 @@ def _fit_of_end(group: Sequence[Record], data: Data, found: Fit) -> float:
         motion=np.where(held, np.nan, data.motion),
         current=None if data.current is None else np.where(held, np.nan, data.current),
     )
-    again = descend(known, found.chain, found.scales, found.initial, found.noise, most=12)
-    measured, simulated = speeds(data, again.motion)
-    return percent(np.where(held, measured, np.nan), simulated, float(np.nanstd(measured)))
+    again = descend(known, found.chain, found.scales, found.initial, found.noise, max_steps=12)
+    measured, simulated = compare_speeds(data, again.motion)
+    return compute_fit_percent(
+        np.where(held, measured, np.nan), simulated, float(np.nanstd(measured))
+    )
 
 
-def cut_of(record: Record) -> int:
+def find_holdout_start(record: Record) -> int:
     """Return the row from which a record is held out, its length where it is too short."""
     cut = int(FITTED_SHARE * len(record))
-    return len(record) if cut < 2 * MIN_ROWS or len(record) - cut < MIN_ROWS else cut
+    return len(record) if cut < 2 * MIN_PART_ROWS or len(record) - cut < MIN_PART_ROWS else cut
 
 
-def split(records: Sequence[Record]) -> tuple[list[Record], list[Record]]:
+def split_holdout(records: Sequence[Record]) -> tuple[list[Record], list[Record]]:
     """Divide records into a part to fit and a part to hold out."""
     if len(records) >= 3:
         n = max(1, round((1 - FITTED_SHARE) * len(records)))
-        kept = list(range(1, len(records), max(1, len(records) // n)))[:n]
+        held_out = list(range(1, len(records), max(1, len(records) // n)))[:n]
         return (
-            [r for i, r in enumerate(records) if i not in kept],
-            [r for i, r in enumerate(records) if i in kept],
+            [r for i, r in enumerate(records) if i not in held_out],
+            [r for i, r in enumerate(records) if i in held_out],
         )
     fitted, kept_records = [], []
     for record in records:
-        cut = cut_of(record)
+        cut = find_holdout_start(record)
         fitted.append(record.slice(0, cut))
         if cut < len(record):
             kept_records.append(record.slice(cut, len(record)))
@@ -182,13 +186,15 @@ def simulate(estimate: Estimate, record: Record) -> tuple[Array, Array]:
     data = prepare([record], False)
     scales = data.scales(max(estimate.value("time_constant"), data.rows.step))
     scales = replace(scales, volts=estimate.largest_voltage or scales.volts)
-    measured, simulated = speeds(data, settle(data, motion_chain(estimate, data.is_angle), scales))
+    measured, simulated = compare_speeds(
+        data, simulate_freely(data, select_motion_chain(estimate, data.is_angle), scales)
+    )
     return measured, simulated
 
 
-def motion_chain(estimate: Estimate, is_angle: bool) -> Chain:
+def select_motion_chain(estimate: Estimate, is_angle: bool) -> Chain:
     """Return the chain of an estimate as it shows a recording of angles or of speeds."""
-    chain = chain_from(estimate.chain)
+    chain = rebuild_chain(estimate.chain)
     sensor = chain.sensor("speed sensor")
     if sensor is None or isinstance(sensor, Angle) != is_angle:
         chain = chain.with_component(Angle() if is_angle else Speed(), {})

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A speed that is the difference of a coarse counter's counts over one sample: its counts again.
+"""Recover the counts of a speed that is their difference over one sample.
 
 The rounding error of a count enters two neighbouring speeds with opposite signs, so their errors
 are correlated by -1/2 and sum up to that of one count.  Treated as independent errors of the speed
@@ -35,20 +35,20 @@ from smp_motor_ident.limits import (
 from smp_motor_ident.quality.resolution import speed_quantum
 from smp_motor_ident.record import Record
 
-SMOOTH = 9  # samples of a moving mean that keeps the motion and removes the rounding
-LOCAL = 15  # samples over which a motion is a cubic
-SLOW = 100  # largest counts per interval at which the speed's steps show
-LONGER = 2.0  # times the usual interval: longer ones are gaps
-EVEN = 0.5  # of the usual interval: stamps that are off by more may hide a lost sample
+SMOOTHING_SAMPLES = 9  # of a moving mean that keeps the motion and removes the rounding
+CUBIC_SAMPLES = 15  # over which a motion is a cubic
+MAX_STEPPED_COUNTS = 100  # per interval, at which the speed shows its steps
+MIN_GAP_RATIO = 2.0  # of a gap to the usual interval
+MAX_INTERVAL_ERROR = 0.5  # of the usual interval; a larger one may hide a lost sample
 
 
-def counts_again(group: Sequence[Record]) -> list[Record]:
-    """Return records with the angles that their speeds are the differences of, if all are."""
-    summed = [_summed(r) for r in group]
+def recover_counts(group: Sequence[Record]) -> list[Record]:
+    """Return records with angles in place of differenced speeds, if all speeds are such."""
+    summed = [_sum_speed(r) for r in group]
     return list(group) if any(s is r for s, r in zip(summed, group, strict=True)) else summed
 
 
-def _summed(record: Record) -> Record:
+def _sum_speed(record: Record) -> Record:
     velocity = record.velocity
     if velocity is None or record.count is not None or record.position is not None:
         return record
@@ -57,10 +57,12 @@ def _summed(record: Record) -> Record:
         return record
     intervals = np.delete(np.diff(record.time), [s - 1 for s in record.starts if s > 0])
     moved = np.rint(velocity / quantum)
-    if np.abs(intervals - step).max() > EVEN * step or not _against_each_other(moved):
+    if np.abs(intervals - step).max() > MAX_INTERVAL_ERROR * step or not _has_alternating_errors(
+        moved
+    ):
         return record
     angle = np.cumsum(moved) * quantum * step
-    if not _smooth_but_for_one(moved):
+    if not _is_smooth_within_one_count(moved):
         return record
     found = Finding(
         "speed_summed",
@@ -78,53 +80,52 @@ def _summed(record: Record) -> Record:
     )
 
 
-def rounding(record: Record) -> float:
-    """Return the deviation [rad] of the counts that a speed was made of, 0 where it is another."""
+def read_count_rounding(record: Record) -> float:
+    """Return the rounding [rad] of the counts behind a recovered angle, 0 for others."""
     found = next((f for f in record.findings if f.code == "speed_summed"), None)
     if found is None:
         return 0.0
     return float(found.evidence["quantum"] or 0.0) * record.velocity_window / 12**0.5
 
 
-def _smooth_but_for_one(moved: Array) -> bool:
-    """Tell whether counts, where they change, leave a cubic over some samples by one's rounding.
+def _is_smooth_within_one_count(moved: Array) -> bool:
+    """Tell whether changing counts differ from a local cubic by the rounding of one count.
 
-    Of more than a few counts a sample the speed itself can be read, whatever else moves the motor.
+    With more than a few counts per sample the speed itself can be used.
     """
-    if moved.size < LOCAL or np.abs(moved).max() > COUNTS_A_SAMPLE:
+    if moved.size < CUBIC_SAMPLES or np.abs(moved).max() > COUNTS_A_SAMPLE:
         return False
     count = np.cumsum(moved)
     from scipy.signal import savgol_coeffs, savgol_filter  # takes a while to load
 
-    rest = count - savgol_filter(count, LOCAL, 3)
-    turns = np.convolve(moved != 0, np.ones(LOCAL), "same") > 1
-    left = 1 - float(savgol_coeffs(LOCAL, 3)[LOCAL // 2])  # of a white error
+    rest = count - savgol_filter(count, CUBIC_SAMPLES, 3)
+    turns = np.convolve(moved != 0, np.ones(CUBIC_SAMPLES), "same") > 1
+    left = 1 - float(savgol_coeffs(CUBIC_SAMPLES, 3)[CUBIC_SAMPLES // 2])  # of a white error
     return bool(turns.any() and np.mean(np.square(rest[turns])) < ONE_COUNT * left / 12)
 
 
-def _against_each_other(moved: Array) -> bool:
-    """Tell by the correlation of neighbours after removing the smooth motion."""
-    smooth = np.convolve(moved, np.full(SMOOTH, 1 / SMOOTH), "same")
-    rest = (moved - smooth)[SMOOTH:-SMOOTH]
+def _has_alternating_errors(moved: Array) -> bool:
+    """Tell whether neighbours have errors of opposite sign, after removing the motion."""
+    smooth = np.convolve(moved, np.full(SMOOTHING_SAMPLES, 1 / SMOOTHING_SAMPLES), "same")
+    rest = (moved - smooth)[SMOOTHING_SAMPLES:-SMOOTHING_SAMPLES]
     size = float(rest @ rest)
     return size > 0.0 and float(rest[1:] @ rest[:-1]) < NEIGHBOURS * size
 
 
-def over_real_intervals(record: Record) -> Record:
-    """Return a record whose speed was divided by a nominal period with that by the real ones.
+def correct_nominal_period(record: Record) -> Record:
+    """Correct a speed that was divided by a nominal period instead of the real intervals.
 
-    The period is that of the counts a turn where they are known, else the mean interval, which may
-    be another.
+    The period follows from the counts per revolution if known, else it is the mean interval.
     """
     velocity, interval = record.velocity, np.diff(record.time, prepend=np.nan)
     if velocity is None or record.count is not None or record.position is not None:
         return record
     interval[list(record.starts)] = np.nan
-    if not _as_intervals(velocity, interval):
+    if not _follows_intervals(velocity, interval):
         return record
     mean, shortest = float(np.nanmean(interval)), float(np.nanpercentile(interval, 5))
-    counted = _period(velocity, record.hardware.counts_per_revolution, mean)
-    known = shortest / LONGER < counted < mean * LONGER
+    counted = _find_nominal_period(velocity, record.hardware.counts_per_revolution, mean)
+    known = shortest / MIN_GAP_RATIO < counted < mean * MIN_GAP_RATIO
     period = counted if known else mean
     words = "the speed is counts over a nominal period instead of the actual intervals"
     found = Finding(
@@ -140,28 +141,28 @@ def over_real_intervals(record: Record) -> Record:
     return replace(record, velocity=real, velocity_window=mean, findings=(*record.findings, found))
 
 
-def _period(velocity: Array, per_turn: float | None, usual: float) -> float:
-    """Return over which period a count is the step in which slow speeds come, 0 if unknown."""
+def _find_nominal_period(velocity: Array, per_turn: float | None, usual: float) -> float:
+    """Return the period over which one count is the step of slow speeds, 0 if unknown."""
     if not per_turn:
         return 0.0
-    slow = np.abs(velocity) < SLOW * 2 * np.pi / per_turn / usual
+    slow = np.abs(velocity) < MAX_STEPPED_COUNTS * 2 * np.pi / per_turn / usual
     quantum = speed_quantum(velocity[slow])
     return 2 * np.pi / per_turn / quantum if quantum else 0.0
 
 
-def _as_intervals(velocity: Array, interval: Array) -> bool:
-    """Tell whether speeds differ from the mean of their neighbours as their intervals do.
+def _follows_intervals(velocity: Array, interval: Array) -> bool:
+    """Tell whether deviations of speeds from their neighbours' mean follow their intervals.
 
-    That is the slope of a line: one of counts over a nominal period, nothing of a motor's speed.
+    The slope is one for counts over a nominal period, and zero for a motor's speed.
     """
     known = np.isfinite(velocity) & np.isfinite(interval)
     speed, took = velocity[known], interval[known]
     if speed.size < FEWEST or np.std(took) < BEAT_JITTER * np.median(took):
         return False
-    took = np.minimum(took, LONGER * np.median(took))  # the motion in a gap is unknown
-    window = np.full(SMOOTH, 1 / SMOOTH)
+    took = np.minimum(took, MIN_GAP_RATIO * np.median(took))  # the motion in a gap is unknown
+    window = np.full(SMOOTHING_SAMPLES, 1 / SMOOTHING_SAMPLES)
     mean, usual = (np.convolve(x, window, "same") for x in (speed, took))
-    inner = slice(SMOOTH, -SMOOTH)
+    inner = slice(SMOOTHING_SAMPLES, -SMOOTHING_SAMPLES)
     x, y = (mean * (took / usual - 1))[inner], (speed - mean)[inner]
     power = float(x @ x)
     if power <= 0:

@@ -19,26 +19,26 @@ from smp_motor_ident.limits import EDGE_SPEED, EDGES, HALF_EXPLAINED, HELD
 from smp_motor_ident.quality.resolution import speed_quantum
 from smp_motor_ident.record import Record
 
-ROWS = 2.05  # shortest holding time that identifies a count [rows]
-ALIKE = 1.05  # uncertainty of a holding time [rows]
-TRIED = np.arange(1.0, 100.0)  # percentiles tried as the size of a count
-TICK, NEAR = 1e-6, 0.05  # tick of a timer [s]; rounding of a published speed [ticks]
-NEIGHBOURS = 2.5  # rows between two readings that are read off between: with one row left out
-QUICK = 0.25  # rows of a count: a motor that is as fast does not come to rest between two rows
+MIN_HOLDING_ROWS = 2.05  # that identify a count
+HOLDING_TOLERANCE_ROWS = 1.05
+COUNT_PERCENTILES = np.arange(1.0, 100.0)  # percentiles tried as the size of a count
+TIMER_TICK_S, TICK_TOLERANCE = 1e-6, 0.05  # tolerance in ticks
+MAX_NEIGHBOUR_ROWS = 2.5  # between interpolated readings: one row may be missing
+MIN_COUNT_ROWS = 0.25  # of a count; a faster motor does not stop between two rows
 
 
-def between_edges(record: Record) -> Record:
-    """Return a record with an edge-timed speed interpolated instead of held; others unchanged.
+def interpolate_edge_timing(record: Record) -> Record:
+    """Interpolate an edge-timed speed that is held between edges; return others unchanged.
 
     Each reading is assigned to the middle of its edge interval, then interpolated to the rows.
     """
     velocity = record.velocity
     if velocity is None or record.count is not None or record.position is not None:
         return record
-    count = _count_of(record, velocity)
+    count = _find_count_angle(record, velocity)
     if count == 0.0:
         return record
-    known, share = _centre(record, velocity, count)
+    known, share = _interpolate_speed(record, velocity, count)
     found = Finding(
         "edge_timer",
         "warning",
@@ -50,14 +50,14 @@ def between_edges(record: Record) -> Record:
     return replace(record, velocity=known, findings=(*record.findings, found))
 
 
-def held_of(record: Record) -> float:
-    """Return which share of the readings was left out for being held."""
+def read_held_share(record: Record) -> float:
+    """Read the share of readings that were left out as held from the findings."""
     said = [f.evidence["share"] for f in record.findings if f.code == "edge_timer"]
     return sum(float(s or 0.0) for s in said)
 
 
-def _count_of(record: Record, velocity: Array) -> float:
-    """Return the angle of a count, 0 where a speed is not the time of one."""
+def _find_count_angle(record: Record, velocity: Array) -> float:
+    """Find the angle of a count, 0 if the speed is not from the time of one."""
     known = np.flatnonzero(np.isfinite(velocity))
     speed, when = velocity[known], record.time[known]
     at = np.flatnonzero(np.diff(speed) != 0) + 1
@@ -66,29 +66,29 @@ def _count_of(record: Record, velocity: Array) -> float:
     held, after = np.diff(when[at]), np.abs(speed[at[1:]])
     held, after = held[after > 0], after[after > 0]
     per_turn = record.hardware.counts_per_revolution
-    if per_turn and _ticks(2 * np.pi / per_turn / after) and not speed_quantum(velocity):
+    if per_turn and _are_timer_ticks(2 * np.pi / per_turn / after) and not speed_quantum(velocity):
         return 2 * np.pi / per_turn
     step = record.sample_time
-    tells = held > ROWS * step
-    best, most = 0.0, EDGES - 1
-    least = EDGE_SPEED * ROWS * step * float(np.abs(speed).max())
-    for count in np.percentile((held * after)[tells], TRIED) if tells.any() else ():
-        slow = count / after > ROWS * step
-        alike = np.abs(held - count / after)[slow] < ALIKE * step
+    tells = held > MIN_HOLDING_ROWS * step
+    best, max_alike = 0.0, EDGES - 1
+    least = EDGE_SPEED * MIN_HOLDING_ROWS * step * float(np.abs(speed).max())
+    for count in np.percentile((held * after)[tells], COUNT_PERCENTILES) if tells.any() else ():
+        slow = count / after > MIN_HOLDING_ROWS * step
+        alike = np.abs(held - count / after)[slow] < HOLDING_TOLERANCE_ROWS * step
         if count < least or np.unique(after[slow]).size < HALF_EXPLAINED * alike.size:
             continue  # levels of a rounded speed
-        if alike.sum() > most and alike.mean() > HELD:
-            best, most = float(count), int(alike.sum())
+        if alike.sum() > max_alike and alike.mean() > HELD:
+            best, max_alike = float(count), int(alike.sum())
     return best
 
 
-def _ticks(period: Array) -> bool:
-    """Tell whether times of a count are whole microseconds, the ticks of usual timers."""
-    rest = period / TICK - np.rint(period / TICK)
-    return bool(np.mean(np.abs(rest) < NEAR) > HELD)
+def _are_timer_ticks(period: Array) -> bool:
+    """Tell whether times of a count are whole microseconds, as of usual timers."""
+    rest = period / TIMER_TICK_S - np.rint(period / TIMER_TICK_S)
+    return bool(np.mean(np.abs(rest) < TICK_TOLERANCE) > HELD)
 
 
-def _centre(record: Record, velocity: Array, count: float) -> tuple[Array, float]:
+def _interpolate_speed(record: Record, velocity: Array, count: float) -> tuple[Array, float]:
     """Return the interpolated speed at the rows, and the share of rows without a value."""
     speed, step = np.nan_to_num(velocity), record.sample_time
     out = np.full(speed.size, np.nan)
@@ -100,47 +100,49 @@ def _centre(record: Record, velocity: Array, count: float) -> tuple[Array, float
         when, said, time = record.time[rows], speed[rows], took[rows]
         before = np.append(np.nan, said[:-1])
         # After a rest, or back over the same edge, that time is not one of a count.
-        fresh = (said * before > 0) & ((said != before) | (time < QUICK * step))
+        fresh = (said * before > 0) & ((said != before) | (time < MIN_COUNT_ROWS * step))
         # The last edge was up to a row ago, or up to a count where that takes less.
         middle = when - 0.5 * (time + np.minimum(time, step))
-        at, most = np.flatnonzero(fresh), NEIGHBOURS * step
-        out[rows] = _between(when, middle[at], said[at], most)
-        close = _close(middle[at], said[at], most)
+        at, max_gap = np.flatnonzero(fresh), MAX_NEIGHBOUR_ROWS * step
+        out[rows] = _interpolate_rows(when, middle[at], said[at], max_gap)
+        close = _find_adjacent(middle[at], said[at], max_gap)
         # Before a reversal or a rest the last edge may be longer ago than by that.
         own = at[1:-1][close[:-1] & close[1:] & (time[at[1:-1]] <= step)]
-        out[rows][own] = _ahead(when, middle, said, own, at)
+        out[rows][own] = _extrapolate_readings(when, middle, said, own, at)
         zero = (said == 0) & np.isfinite(velocity[rows])
-        out[rows][_rests(when, zero, 2 * longest + step)] = 0.0
+        out[rows][_find_rests(when, zero, 2 * longest + step)] = 0.0
     lost = np.isfinite(velocity) & ~np.isfinite(out)
     return out, float(lost.mean())
 
 
-def _close(middle: Array, said: Array, most: float) -> Flags:
-    """Tell which readings are close behind the one before, and of its sign."""
+def _find_adjacent(middle: Array, said: Array, max_gap: float) -> Flags:
+    """Mark readings that closely follow one of the same sign."""
     apart = np.diff(middle)
-    return np.asarray((apart > 0) & (apart < most) & (said[1:] * said[:-1] > 0))
+    return np.asarray((apart > 0) & (apart < max_gap) & (said[1:] * said[:-1] > 0))
 
 
-def _ahead(when: Array, middle: Array, said: Array, own: Integers, at: Integers) -> Array:
-    """Return readings as far ahead as they are late, along the way from the one before.
+def _extrapolate_readings(
+    when: Array, middle: Array, said: Array, own: Integers, at: Integers
+) -> Array:
+    """Extrapolate readings to their rows from the reading before.
 
-    The voltage may change in a reading's own row, so that what follows tells of another motion.
+    The voltage may change in a reading's own row, so later readings belong to another motion.
     """
     before = at[np.searchsorted(at, own) - 1]
     slope = (said[own] - said[before]) / (middle[own] - middle[before])
     return np.asarray(said[own] + (when[own] - middle[own]) * slope)
 
 
-def _between(when: Array, middle: Array, said: Array, most: float) -> Array:
-    """Return what readings say of rows: linear between two that are close, else of the nearest.
+def _interpolate_rows(when: Array, middle: Array, said: Array, max_gap: float) -> Array:
+    """Interpolate adjacent readings linearly at the rows; a lone one holds in its nearest row.
 
-    In the nearest row a reading is off by up to half of one, in which a quick motor reverses.
+    There it is up to half a row off, in which a fast motor may reverse.
     """
     out = np.full(when.size, np.nan)
     if middle.size < 2:
         return out
     middle = np.maximum.accumulate(middle)
-    close = _close(middle, said, most)
+    close = _find_adjacent(middle, said, max_gap)
     alone = ~(np.append(close, False) | np.append(False, close)) & (middle >= when[0])
     row = np.interp(middle[alone], when, np.arange(when.size))
     out[np.rint(row).astype(np.int64)] = said[alone]
@@ -151,8 +153,8 @@ def _between(when: Array, middle: Array, said: Array, most: float) -> Array:
     return out
 
 
-def _rests(when: Array, zero: Flags, longest: float) -> Flags:
-    """Return the rows of a rest: one that is over sooner may be a reversal, within two counts."""
+def _find_rests(when: Array, zero: Flags, longest: float) -> Flags:
+    """Mark the rows of rests; a shorter one may be a reversal within two counts."""
     edges = np.flatnonzero(np.diff(zero.astype(np.int8), prepend=0, append=0))
     out = np.zeros(when.size, dtype=np.bool_)
     for first, after in zip(edges[::2], edges[1::2], strict=True):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The parts of recordings that tell of a motor: the excitation, and stretches of a long one."""
+"""Select the informative parts of recordings: the excitation, and stretches of long ones."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -11,23 +11,23 @@ from smp_motor_ident.finding import Finding
 from smp_motor_ident.limits import EXCERPT, FEWEST, REST
 from smp_motor_ident.record import Record
 
-STRETCHES = 8
-"""Stretches of a long record: enough to show a motor that changes, each long against its lag."""
+STRETCH_COUNT = 8
+"""Number of stretches of a long record: they show changes, and each is long against the lag."""
 
-LONG = 2_000  # samples of rest that are worth removing
-MARGIN = 10  # samples of rest kept on either side
-SCATTER = 6.0  # standard deviations of sensor noise that do not count as motion
+MIN_REST_ROWS = 2_000
+REST_MARGIN = 10  # on either side
+MAX_NOISE_STDS = 6.0  # of the sensor, that do not count as motion
 
 
-def _scatter(values: Array) -> float:
+def _estimate_white_std(values: Array) -> float:
     """Return the standard deviation of white noise, by the median fourth difference: 1 4 6 4 1."""
     if values.size < 8:
         return 0.0
     return float(np.median(np.abs(np.diff(values, n=4))) / 0.6745 / np.sqrt(70))
 
 
-def excitation(record: Record) -> tuple[int, int]:
-    """Return the rows from a record's first to its last excitation, as of `Record.slice`."""
+def find_excitation(record: Record) -> tuple[int, int]:
+    """Return first and end of the excited rows of a record, for `Record.slice`."""
     moves = np.abs(record.voltage) > REST * np.abs(record.voltage).max()
     for name in ("velocity", "position", "count"):
         values = getattr(record, name)
@@ -35,32 +35,32 @@ def excitation(record: Record) -> tuple[int, int]:
             continue
         y = np.where(np.isfinite(values), values, 0.0)
         y = y if name == "velocity" else np.diff(y, prepend=y[0])
-        noise = 0.0 if name == "count" else _scatter(y)
-        moves |= np.abs(y) > max(REST * float(np.abs(y).max()), SCATTER * noise)
+        noise = 0.0 if name == "count" else _estimate_white_std(y)
+        moves |= np.abs(y) > max(REST * float(np.abs(y).max()), MAX_NOISE_STDS * noise)
         break
     busy = np.flatnonzero(moves)
     # A rest shorter than the excitation does not hide it, and shows the sensor's noise.
-    if not busy.size or (busy[0] < LONG and len(record) < 2 * (busy[-1] - busy[0])):
+    if not busy.size or (busy[0] < MIN_REST_ROWS and len(record) < 2 * (busy[-1] - busy[0])):
         return 0, len(record)
-    # An offset of the sensor, seen long enough at rest, would speak against any friction.
-    return max(0, int(busy[0]) - MARGIN), min(len(record), int(busy[-1]) + MARGIN + 1)
+    # A sensor offset during a long rest would contradict any friction.
+    return max(0, int(busy[0]) - REST_MARGIN), min(len(record), int(busy[-1]) + REST_MARGIN + 1)
 
 
-def excerpts(records: Sequence[Record], most: int = round(EXCERPT)) -> list[Record]:
-    """Return evenly spread stretches of records that have more than ``most`` rows in all."""
+def select_excerpts(records: Sequence[Record], max_rows: int = round(EXCERPT)) -> list[Record]:
+    """Return evenly spread stretches of records that have more than ``max_rows`` rows in all."""
     rows = sum(map(len, records))
-    count = -(-STRETCHES // len(records)) if records else 0
+    count = -(-STRETCH_COUNT // len(records)) if records else 0
     parts: list[Record] = []
     for record in records:
-        length = most * len(record) // (rows * count)
-        if rows <= most or length < FEWEST:
+        length = max_rows * len(record) // (rows * count)
+        if rows <= max_rows or length < FEWEST:
             parts.append(record)
         else:
-            parts += _stretches(record, count, length)
+            parts += _cut_stretches(record, count, length)
     return parts
 
 
-def _stretches(record: Record, count: int, length: int) -> list[Record]:
+def _cut_stretches(record: Record, count: int, length: int) -> list[Record]:
     """Return stretches of so many rows each, with a finding that tells of them."""
     found = Finding(
         "excerpt",

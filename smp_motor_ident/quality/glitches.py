@@ -16,22 +16,22 @@ from smp_motor_ident.finding import Finding
 from smp_motor_ident.limits import GLITCH, GLITCHES
 from smp_motor_ident.record import Record
 
-SHARE = 0.05  # of the signal's range, and of the voltage's: less is no glitch, and no pulse
-CHANGES = 4.0  # usual changes from one reading to the next: a counter dithers by one or two
-ENOUGH = 4_000  # readings used for the usual change
-PASSES = 4  # each finds one of several in a row
+MIN_GLITCH_SHARE = 0.05  # of the signal's range, and of the voltage's for a pulse
+MIN_CHANGE_RATIO = 4.0  # of a glitch to the usual change; counters dither by one or two
+MAX_SAMPLED_READINGS = 4_000  # for the usual change
+MAX_PASSES = 4  # each finds one of several in a row
 
 
-def without_glitches(record: Record) -> Record:
-    """Return a record without readings of speed and angle that jump away and back."""
+def remove_glitches(record: Record) -> Record:
+    """Remove readings of speed and angle that jump away and back from a record."""
     if record.count is not None and record.hardware.counts_per_revolution:
         return record
-    pulsed = _pulses(record.voltage)
+    pulsed = _mark_pulses(record.voltage)
     for name in ("velocity", "position"):
         values = getattr(record, name)
         if values is None:
             continue
-        wrong = _glitches(values, pulsed)
+        wrong = _find_glitches(values, pulsed)
         if not wrong.any() or wrong.mean() > GLITCHES:
             continue
         first = int(np.argmax(wrong))
@@ -54,20 +54,20 @@ def count_glitches(record: Record, name: str) -> int:
     return sum(int(e["samples"] or 0) for e in said if e["signal"] == name)
 
 
-def _glitches(values: Array, pulsed: Flags) -> Flags:
+def _find_glitches(values: Array, pulsed: Flags) -> Flags:
     wrong = np.zeros(values.size, dtype=np.bool_)
-    for _ in range(PASSES):
+    for _ in range(MAX_PASSES):
         at = np.flatnonzero(np.isfinite(values) & ~wrong)
-        beyond = _beyond(values[at])
+        beyond = _compute_excess(values[at])
         if beyond.size < 8 or not beyond.any():
             break
-        some = slice(None, None, 1 + at.size // ENOUGH)
+        some = slice(None, None, 1 + at.size // MAX_SAMPLED_READINGS)
         low, high = np.percentile(values[at][some], (1, 99))
         moves = np.abs(np.diff(values[at]))[some]
         least = max(
             GLITCH * float(np.percentile(beyond[some], 75)),
-            CHANGES * float(np.median(moves[moves > 0])) if moves.any() else 0.0,
-            SHARE * float(high - low),
+            MIN_CHANGE_RATIO * float(np.median(moves[moves > 0])) if moves.any() else 0.0,
+            MIN_GLITCH_SHARE * float(high - low),
         )
         found = at[1:-1][beyond > least]
         found = found[~pulsed[found]]
@@ -77,16 +77,16 @@ def _glitches(values: Array, pulsed: Flags) -> Flags:
     return wrong
 
 
-def _beyond(values: Array) -> Array:
+def _compute_excess(values: Array) -> Array:
     """Return the excess of readings over both of their neighbours, shape (n - 2,)."""
     before, after = values[1:-1] - values[:-2], values[1:-1] - values[2:]
     same = np.sign(before) == np.sign(after)
     return np.where(same, np.minimum(np.abs(before), np.abs(after)), 0.0)
 
 
-def _pulses(voltage: Array) -> Flags:
+def _mark_pulses(voltage: Array) -> Flags:
     """Mark the rows next to a one-sample voltage pulse, which a fast motor follows."""
     pulse = np.zeros(voltage.size, dtype=np.bool_)
-    pulse[1:-1] = _beyond(voltage) > SHARE * float(np.ptp(voltage))
+    pulse[1:-1] = _compute_excess(voltage) > MIN_GLITCH_SHARE * float(np.ptp(voltage))
     near: Flags = np.convolve(pulse, np.ones(5), "same") > 0
     return near

@@ -8,11 +8,11 @@ import numpy as np
 from smp_motor_control.arrays import Array
 from smp_motor_ident._compile import compiled
 
-DECAYED = 1e-100  # its square is still a normal number
+MIN_DECAYED_VALUE = 1e-100  # its square is still a normal number
 
 
-def lagged(values: Array, samples: float) -> Array:
-    """Return a signal through a lag of so many samples, from rest; unchanged for a lag of 0.
+def apply_lag(values: Array, samples: float) -> Array:
+    """Filter a signal by a lag of ``samples``, from rest; leave it unchanged for a lag of 0.
 
     Tails are set to zero before they become subnormal numbers, which slow
     ``scipy.signal.lfilter`` tenfold.
@@ -20,15 +20,15 @@ def lagged(values: Array, samples: float) -> Array:
     if samples == 0.0:
         return values
     out = np.empty(values.size)
-    _lag(np.asarray(values, dtype=np.float64), float(np.exp(-1 / samples)), out)
+    _filter_lag(np.asarray(values, dtype=np.float64), float(np.exp(-1 / samples)), out)
     return out
 
 
 @compiled
-def _lag(values: Array, keeps: float, out: Array) -> None:
+def _filter_lag(values: Array, keeps: float, out: Array) -> None:
     state = 0.0
     for n in range(values.size):
         state = keeps * state + (1 - keeps) * values[n]
-        if abs(state) < DECAYED:
+        if abs(state) < MIN_DECAYED_VALUE:
             state = 0.0
         out[n] = state

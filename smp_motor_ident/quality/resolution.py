@@ -10,19 +10,18 @@ import numpy as np
 from smp_motor_control.arrays import Array, Flags, Integers
 from smp_motor_ident.record import Record
 
-REST = 10  # samples after which an unchanged count counts as standstill
-FINEST_ENCODER = 2 * np.pi / 2**17
+MIN_REST_SAMPLES = 10  # of an unchanged count at standstill
+MIN_ENCODER_STEP = 2 * np.pi / 2**17
 """Resolution [rad] of the encoders of servos, finer than those of any wheel."""
-FINEST_SENSOR = 1e-4  # of its range: what shunt amplifiers and tachometers are linear to at best
-FEW = 2_000  # samples that tell whether a speed repeats its values
-MANY = 30
-"""Levels of moves that tell a step by being near whole ones on the mean, each off by a part of it
-as a log of seven digits makes them: five deviations from chance."""
-UNIFORM = 0.25  # mean distance of a random number from the nearest whole number
+MIN_SENSOR_STEP_SHARE = 1e-4  # of its range: the best linearity of amplifiers, tachometers
+MAX_SAMPLED_READINGS = 2_000  # to decide whether a speed repeats its values
+MIN_LEVELS = 30
+"""Levels whose mean distance from multiples of a step shows it: five deviations from chance."""
+UNIFORM_DISTANCE = 0.25  # mean distance of a random number from the nearest whole number
 
 
-def angle_of(record: Record) -> tuple[Array, float] | None:
-    """Return a record's angle relative to the first [rad] and its step, if it has an angle."""
+def select_angle(record: Record) -> tuple[Array, float] | None:
+    """Return a record's angle relative to the first one [rad] and its step, None without angle."""
     per_turn = record.hardware.counts_per_revolution
     if record.count is not None and per_turn:
         quantum = 2 * np.pi / per_turn
@@ -33,7 +32,7 @@ def angle_of(record: Record) -> tuple[Array, float] | None:
     return None
 
 
-def repeats(count: Integers, starts: Sequence[int]) -> Flags:
+def mark_repeats(count: Integers, starts: Sequence[int]) -> Flags:
     """Mark repeated readings of an encoder at rest, which all have the same error.
 
     Treated as independent readings, they would determine the angle far better than to the unknown
@@ -46,7 +45,7 @@ def repeats(count: Integers, starts: Sequence[int]) -> Flags:
     begins[1:] |= count[1:] != count[:-1]
     begin = np.flatnonzero(begins)
     length = np.diff(np.append(begin, count.size))
-    rests = length >= REST
+    rests = length >= MIN_REST_SAMPLES
     if not rests.any():
         return np.zeros(count.size, dtype=np.bool_)
     repeats = np.repeat(rests, length)
@@ -59,11 +58,11 @@ def angle_quantum(angle: Array) -> float:
     """Return the step [rad] of an angle by counts or rounding; 0 without steps."""
     every = np.abs(np.diff(angle))
     # A slow motor moves once in a hundred rows; lost samples compare as smaller.
-    moves = np.sort(every[every > FINEST_ENCODER][:20_000])
+    moves = np.sort(every[every > MIN_ENCODER_STEP][:20_000])
     rests = moves.size < 0.5 * every.size
     if moves.size < 50:
         return 0.0
-    moves = moves[:: -(-moves.size // FEW)]
+    moves = moves[:: -(-moves.size // MAX_SAMPLED_READINGS)]
     for parts in (1, 2, 3):  # a motor that is fast in every sample may show no single step
         quantum = float(moves[0]) / parts
         for reach in (4.0, 20.0, 100.0, np.inf):  # the longer moves tell it better
@@ -76,13 +75,13 @@ def angle_quantum(angle: Array) -> float:
         single = levels == 2 or (levels == 1 and rests)
         if (levels > 2 and np.mean(off < 0.05) > 0.95) or (single and off.max() < 0.005):
             return quantum
-        if levels > MANY and _mean_of_each(whole, off) < 0.5 * UNIFORM:
+        if levels > MIN_LEVELS and _average_levels(whole, off) < 0.5 * UNIFORM_DISTANCE:
             return quantum
     return 0.0
 
 
-def _mean_of_each(level: Array, off: Array) -> float:
-    """Return the mean over levels of the mean at each: a speed that stays counts once."""
+def _average_levels(level: Array, off: Array) -> float:
+    """Average over levels, so that a constant speed counts once."""
     _, which, often = np.unique(level, return_inverse=True, return_counts=True)
     return float(np.mean(np.bincount(which, off) / often))
 
@@ -98,8 +97,8 @@ def speed_quantum(velocity: Array) -> float:
         return 0.0
     span = float(np.ptp(x))
     # Steps of a five-hundredth of the span or more repeat; a speed without steps hardly does.
-    few = np.sort(x[:: -(-x.size // FEW)])
-    if few.size > FEW // 2 and np.mean(np.diff(few) <= 1e-6 * span) < 0.2:
+    few = np.sort(x[:: -(-x.size // MAX_SAMPLED_READINGS)])
+    if few.size > MAX_SAMPLED_READINGS // 2 and np.mean(np.diff(few) <= 1e-6 * span) < 0.2:
         return 0.0
     levels = np.unique(x)
     steps = np.diff(levels)

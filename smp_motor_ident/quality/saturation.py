@@ -12,10 +12,10 @@ from smp_motor_ident.finding import Finding
 from smp_motor_ident.limits import REGULATED
 from smp_motor_ident.record import Record
 
-SMOOTH = 9  # samples of a moving mean that keeps the motion of a speed from counts
+SMOOTHING_SAMPLES = 9  # of a moving mean that keeps the motion of a speed from counts
 
 
-def saturation(record: Record, speed: Array, where: str) -> Iterator[Finding]:
+def refuse_saturation(record: Record, speed: Array, where: str) -> Iterator[Finding]:
     """Refuse a speed or current that rests at its limit while the voltage moves.
 
     Yield a finding for a current that a driver regulates.
@@ -28,7 +28,7 @@ def saturation(record: Record, speed: Array, where: str) -> Iterator[Finding]:
         ok = np.isfinite(values)
         x, v = values[ok], record.voltage[ok]
         levels, times = np.unique(x, return_counts=True)
-        if x.size < 50 or levels.size < 20 or _one_level(v):
+        if x.size < 50 or levels.size < 20 or _has_one_level(v):
             continue
         for limit in (x.max(), x.min()):
             at = x == limit
@@ -46,9 +46,11 @@ def saturation(record: Record, speed: Array, where: str) -> Iterator[Finding]:
             if early.sum() < limits.AT_LIMIT:
                 continue
             low, high = np.percentile(v[early], [5, 95])
-            if high - low < 10 * limits.METER * np.ptp(v) and not _abrupt(x, at):
+            if high - low < 10 * limits.METER * np.ptp(v) and not _jumps_to_limit(x, at):
                 continue
-            if name == "current" and _holds(record.current == limit, record.voltage, speed):
+            if name == "current" and _fits_constant_current(
+                record.current == limit, record.voltage, speed
+            ):
                 regulated = max(regulated, abs(float(limit)))
                 continue
             raise SignalError(
@@ -57,10 +59,10 @@ def saturation(record: Record, speed: Array, where: str) -> Iterator[Finding]:
                 "lower the excitation"
             )
     if regulated:
-        yield _regulated(regulated)
+        yield _report_regulation(regulated)
 
 
-def _regulated(current: float) -> Finding:
+def _report_regulation(current: float) -> Finding:
     """Report the effect of a current-regulating driver on the estimate."""
     return Finding(
         "current_regulated",
@@ -73,26 +75,26 @@ def _regulated(current: float) -> Finding:
     )
 
 
-def _holds(rests: Flags, voltage: Array, speed: Array) -> bool:
+def _fits_constant_current(rests: Flags, voltage: Array, speed: Array) -> bool:
     """Tell whether the voltage fits the speed at a constant current, ``v = R i + K w``.
 
     Behind a clipped sensor the current varies, and the voltage does not fit.
     """
-    padded = np.pad(np.nan_to_num(speed), SMOOTH // 2, mode="edge")
-    smooth = np.convolve(padded, np.full(SMOOTH, 1 / SMOOTH), mode="valid")
+    padded = np.pad(np.nan_to_num(speed), SMOOTHING_SAMPLES // 2, mode="edge")
+    smooth = np.convolve(padded, np.full(SMOOTHING_SAMPLES, 1 / SMOOTHING_SAMPLES), mode="valid")
     v, w = voltage[rests], smooth[rests]
     v, w = v - v.mean(), w - w.mean()
     both = float(v @ w)
     return both > 0 and both**2 > REGULATED * float((v @ v) * (w @ w))
 
 
-def _one_level(v: Array) -> bool:
+def _has_one_level(v: Array) -> bool:
     """Tell whether the motor is driven by one level of voltage, at which it may come to rest."""
     driven = v[np.abs(v) > limits.REST * np.abs(v).max()]
     return not driven.size or bool(np.ptp(driven) < 10 * limits.METER * np.abs(driven).max())
 
 
-def _abrupt(x: Array, at: Flags) -> bool:
+def _jumps_to_limit(x: Array, at: Flags) -> bool:
     """Tell a clipped signal from one that settles: it jumps to its limit, scatters elsewhere."""
     enters = np.flatnonzero(at[1:] & ~at[:-1]) + 1
     rest = x[(x != x.max()) & (x != x.min())]

@@ -9,47 +9,45 @@ from smp_motor_control.arrays import Array
 from smp_motor_ident import limits
 from smp_motor_ident.errors import CurrentError, InsufficientExcitationError, SignalError
 from smp_motor_ident.finding import Finding
-from smp_motor_ident.quality.edge_timer import held_of
+from smp_motor_ident.quality.edge_timer import read_held_share
 from smp_motor_ident.quality.glitches import count_glitches
-from smp_motor_ident.quality.saturation import saturation
-from smp_motor_ident.quality.signs import likeness, refuse_lost_sign
-from smp_motor_ident.quality.silence import silent
+from smp_motor_ident.quality.saturation import refuse_saturation
+from smp_motor_ident.quality.signs import correlate_with_voltage, refuse_lost_sign
+from smp_motor_ident.quality.silence import refuse_silent_sensor
 from smp_motor_ident.quality.units import (
-    cause_of_ratio,
-    implausible_voltage,
-    one_unit_of_time,
+    check_voltage,
+    explain_ratio,
+    refuse_mixed_time_units,
 )
 from smp_motor_ident.record import Record
 
-RUNS = 2_000  # runs of samples in which signals are averaged before they are compared
 
-
-def screen(records: Sequence[Record]) -> list[Finding]:
+def screen_records(records: Sequence[Record]) -> list[Finding]:
     """Refuse records without a valid estimate; name the reason and the remedy."""
-    warnings = implausible_voltage(records)
-    where = where_of(records)
-    one_unit_of_time(records)
-    _length(records, where)
+    warnings = check_voltage(records)
+    where = name_records(records)
+    refuse_mixed_time_units(records)
+    _check_length(records, where)
     for record in records:
-        warnings += _lost(record)
-    _resolution(records, where)
+        warnings += _check_lost_samples(record)
+    _check_resolution(records, where)
     refuse_lost_sign(records, [measured_speed(r) for r in records], where)
-    _excitation(records, where)
+    _check_excitation(records, where)
     for record in records:
-        warnings += saturation(record, measured_speed(record), where_of([record]))
-        _ratio(record)
-    _standing(records, where)
+        warnings += refuse_saturation(record, measured_speed(record), name_records([record]))
+        _check_ratios(record)
+    _check_standing(records, where)
     for record in records:
-        silent(record, where_of([record]))
-    _motion(records, where)
-    _signs(records, where)
-    for record in _turning(records):  # the many do not hide the one
-        _signs([record], where_of([record]), late=False)
+        refuse_silent_sensor(record, name_records([record]))
+    _check_motion(records, where)
+    _check_signs(records, where)
+    for record in _select_turning(records):  # others must not hide a single one
+        _check_signs([record], name_records([record]), late=False)
     read = [finding for record in records for finding in record.findings]
     return [*warnings, *(f for k, f in enumerate(read) if f not in read[:k])]
 
 
-def _resolution(records: Sequence[Record], where: str) -> None:
+def _check_resolution(records: Sequence[Record], where: str) -> None:
     if any(np.isfinite(measured_speed(r)).any() for r in records):
         return
     if any(r.count is not None and not r.hardware.counts_per_revolution for r in records):
@@ -58,13 +56,13 @@ def _resolution(records: Sequence[Record], where: str) -> None:
         )
 
 
-def where_of(records: Sequence[Record]) -> str:
+def name_records(records: Sequence[Record]) -> str:
     """Return files and wheel in words."""
     sources = ", ".join(dict.fromkeys(r.source for r in records if r.source))
     return f"{sources or 'record'}: {records[0].wheel}"
 
 
-def _length(records: Sequence[Record], where: str) -> None:
+def _check_length(records: Sequence[Record], where: str) -> None:
     samples = sum(len(r) for r in records)
     if samples < limits.FEWEST:
         duration = sum(r.duration for r in records)
@@ -75,20 +73,20 @@ def _length(records: Sequence[Record], where: str) -> None:
         )
 
 
-def _lost(record: Record) -> Iterator[Finding]:
-    where = where_of([record])
+def _check_lost_samples(record: Record) -> Iterator[Finding]:
+    where = name_records([record])
     for name in ("velocity", "position"):
         values = getattr(record, name)
         if values is None or (record.count is not None and record.hardware.counts_per_revolution):
             continue
         lost = float(np.mean(~np.isfinite(values)))
-        lost -= held_of(record) if name == "velocity" else 0.0  # which is said already
+        lost -= read_held_share(record) if name == "velocity" else 0.0  # which has a finding
         if lost > limits.MOST_LOST and (name == "velocity" or record.velocity is None):
             raise SignalError(
                 f"{where}: {name} is NaN in {100 * lost:.0f} % of the samples; "
                 "repair the sensor or its connection and record again"
             )
-        lost -= count_glitches(record, name) / len(record)  # which are said already
+        lost -= count_glitches(record, name) / len(record)  # which have a finding
         if lost > 0:
             yield _report_left_out(name, lost)
     if record.current is not None:
@@ -102,7 +100,7 @@ def _report_left_out(name: str, lost: float) -> Finding:
     return Finding("samples_lost", "warning", message, {"signal": name, "share": lost})
 
 
-def _excitation(records: Sequence[Record], where: str) -> None:
+def _check_excitation(records: Sequence[Record], where: str) -> None:
     largest = max(float(np.abs(r.voltage).max()) for r in records)
     supply = max(r.hardware.supply_voltage or 0.0 for r in records)
     if largest <= limits.METER * supply:
@@ -120,7 +118,7 @@ def _excitation(records: Sequence[Record], where: str) -> None:
     if (
         all(still)
         and float(np.ptp(levels)) < limits.METER * abs(levels[0])
-        and not any(_starts(r) for r in records)
+        and not any(_rises_at_start(r) for r in records)
     ):
         raise InsufficientExcitationError(
             f"{where}: the voltage is constant at {levels[0]:.4g} V; a constant "
@@ -128,10 +126,10 @@ def _excitation(records: Sequence[Record], where: str) -> None:
         )
 
 
-LEAST_MEANS = 12  # of a record, from which their scatter is known
+MIN_MEANS = 12  # of a record, to know their scatter
 
 
-def _starts(record: Record) -> bool:
+def _rises_at_start(record: Record) -> bool:
     """Tell whether a speed rises under a constant voltage: a step before the first row.
 
     Means over several lengths are compared, since the rise may take few samples or many; their
@@ -142,7 +140,7 @@ def _starts(record: Record) -> bool:
     if speed.size < limits.FEWEST:
         return False
     length = 1
-    while speed.size // length >= LEAST_MEANS:
+    while speed.size // length >= MIN_MEANS:
         means = speed[: speed.size // length * length].reshape(-1, length).mean(axis=1)
         last = means[-(len(means) // 3) :]
         steady = float(np.mean(last))
@@ -170,7 +168,7 @@ def measured_speed(record: Record) -> Array:
     return speed
 
 
-def _ratio(record: Record) -> None:
+def _check_ratios(record: Record) -> None:
     """Compare the signals of the motion with each other; refuse a ratio other than one."""
     per_turn = record.hardware.counts_per_revolution
     angle, what = record.position, "position"
@@ -178,14 +176,16 @@ def _ratio(record: Record) -> None:
         angle = np.asarray(record.count * (2 * np.pi / per_turn), dtype=np.float64)
         what = "encoder counts"
         if record.position is not None:
-            _compare(record, angle, what, record.position, "position")
+            _compare_motions(record, angle, what, record.position, "position")
     if angle is not None and record.velocity is not None:
         charge = np.cumsum(record.velocity[1:] * np.diff(record.time))
-        _compare(record, angle, what, np.concatenate([[0.0], charge]), "velocity")
+        _compare_motions(record, angle, what, np.concatenate([[0.0], charge]), "velocity")
 
 
-def _compare(record: Record, angle: Array, what: str, other_values: Array, other: str) -> None:
-    where = where_of([record])
+def _compare_motions(
+    record: Record, angle: Array, what: str, other_values: Array, other: str
+) -> None:
+    where = name_records([record])
     lag = max(1, min(10, len(record) // 10))
     dt = record.time[lag:] - record.time[:-lag]
     a, b = (angle[lag:] - angle[:-lag]) / dt, (other_values[lag:] - other_values[:-lag]) / dt
@@ -214,11 +214,11 @@ def _compare(record: Record, angle: Array, what: str, other_values: Array, other
         ratio = float(np.sqrt(low * high))
         raise SignalError(
             f"{where}: {other} is {ratio:.4g} times its value by the {what}; "
-            f"{cause_of_ratio(ratio, record.hardware)}"
+            f"{explain_ratio(ratio, record.hardware)}"
         )
 
 
-def _standing(records: Sequence[Record], where: str) -> None:
+def _check_standing(records: Sequence[Record], where: str) -> None:
     """Refuse a speed that stays at 0 or at a sensor's offset for any voltage."""
     speeds = [s[np.isfinite(s)] for s in map(measured_speed, records)]
     speeds = [s for s in speeds if s.size]
@@ -232,7 +232,7 @@ def _standing(records: Sequence[Record], where: str) -> None:
         )
 
 
-def _motion(records: Sequence[Record], where: str) -> None:
+def _check_motion(records: Sequence[Record], where: str) -> None:
     counts = [int(np.ptp(r.count)) for r in records if r.count is not None]
     if counts and len(counts) == len(records) and max(counts) < 20:
         raise InsufficientExcitationError(
@@ -241,17 +241,17 @@ def _motion(records: Sequence[Record], where: str) -> None:
         )
 
 
-def _signs(records: Sequence[Record], where: str, late: bool = True) -> None:
-    """Refuse speed or current that answers the voltage with the wrong sign, or so late that a late
-    answer is a reversed one.
-    """
+def _check_signs(records: Sequence[Record], where: str, late: bool = True) -> None:
+    """Refuse a speed or current whose sign is wrong, or whose delay hides the sign."""
     for what, remedy in (
         ("speed", "swap the motor's leads or the encoder's channels, or scale it by -1"),
         ("current", "swap the current sensor's sign, or scale it by -1"),
     ):
         kept = [r for r in records if what == "speed" or r.current is not None]
         signals = [measured_speed(r) if what == "speed" else r.current for r in kept]
-        found = likeness(kept, [s for s in signals if s is not None], lags=what == "speed")
+        found = correlate_with_voltage(
+            kept, [s for s in signals if s is not None], lags=what == "speed"
+        )
         if found is None:
             continue
         sure = limits.SIGN_SURE * found.chance
@@ -265,14 +265,15 @@ def _signs(records: Sequence[Record], where: str, late: bool = True) -> None:
             )
         follows = found.wrong > max(least, min(sure, limits.SIGN_ALIKE))
         if late and what == "speed" and follows and found.wrong > limits.SIGN_NEARER * found.right:
+            period = _find_sign_period(records)
             raise InsufficientExcitationError(
-                f"{where}: the voltage changes too fast, with a period of {_period(records):.2g} "
+                f"{where}: the voltage changes too fast, with a period of {period:.2g} "
                 "samples: a speed delayed by sampling, a filter or a window cannot be told from "
                 "one of opposite sign; excite more slowly"
             )
 
 
-def _turning(records: Sequence[Record]) -> list[Record]:
+def _select_turning(records: Sequence[Record]) -> list[Record]:
     """Return the records whose motor turned; others show only the sign of an offset."""
     scatter = [float(np.nanstd(measured_speed(r))) for r in records]
     return [
@@ -282,7 +283,7 @@ def _turning(records: Sequence[Record]) -> list[Record]:
     ]
 
 
-def _period(records: Sequence[Record]) -> float:
+def _find_sign_period(records: Sequence[Record]) -> float:
     """Return the period of the voltage's sign changes [samples]."""
     changes = sum(np.count_nonzero(np.diff(np.sign(r.voltage))) for r in records)
     return 2 * sum(len(r) for r in records) / max(changes, 1)

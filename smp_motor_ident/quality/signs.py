@@ -20,41 +20,43 @@ from smp_motor_ident.limits import (
     SIGN_LEAST,
     SIGN_SURE,
 )
-from smp_motor_ident.quality.lag import lagged
+from smp_motor_ident.quality.lag import apply_lag
 from smp_motor_ident.record import Record
 
-LAGS = 16  # from a sampling interval to a quarter of the record, each 1.5 to 2 times the last
-ANSWERS = 8  # of the lags, up to a tenth of the record, for the response to an unsigned voltage
-FINE = 16  # samples that resolve a lag
-RUNS = 2_000  # stretches over which signals are averaged: in them a counter's noise is small
-WAYS = 50  # runs of a record over which its way is summed
+LAG_COUNT = 16  # from a sampling interval to a quarter of the record, each 1.5 to 2 times the last
+MAGNITUDE_LAG_COUNT = 8  # up to a tenth of the record
+SAMPLES_PER_LAG = 16
+MAX_RUNS = 2_000  # over which signals are averaged, to reduce a counter's noise
+TRAVEL_RUNS = 50  # of a record
 
 
 @dataclass(frozen=True)
-class Likeness:
+class SignCorrelation:
     """The largest correlations of a signal with the voltage that came through a lag."""
 
     right: float  # as it is
     wrong: float  # with the other sign
-    chance: float  # standard deviation of the latter, where the signals have no part in each other
+    chance: float  # standard deviation of the latter for independent signals
 
 
-def likeness(records: Sequence[Record], signals: Sequence[Array], lags: bool) -> Likeness | None:
+def correlate_with_voltage(
+    records: Sequence[Record], signals: Sequence[Array], lags: bool
+) -> SignCorrelation | None:
     """Correlate signals with the lagged voltage; None if they are constant."""
-    pairs = [pair for r, y in zip(records, signals, strict=True) if (pair := _smooth(r, y))]
+    pairs = [pair for r, y in zip(records, signals, strict=True) if (pair := _average_runs(r, y))]
     if not any(y.any() for _, _, y in pairs):
         return None
     times = [0.0]
     if lags:
         shortest = min(step for step, _, _ in pairs)
         longest = max(step * v.size for step, v, _ in pairs) / 4
-        times = [0.0, *np.geomspace(shortest, max(longest, 2 * shortest), LAGS)]
+        times = [0.0, *np.geomspace(shortest, max(longest, 2 * shortest), LAG_COUNT)]
     best, worst, reverse = 0.0, 0.0, [(v, y) for _, v, y in pairs]
     for lag in times:
-        every = max(1, int(lag / (FINE * max(step for step, _, _ in pairs))))
-        fewer = [(every * step, _every(v, every), _every(y, every)) for step, v, y in pairs]
+        every = max(1, int(lag / (SAMPLES_PER_LAG * max(step for step, _, _ in pairs))))
+        fewer = [(every * step, _decimate(v, every), _decimate(y, every)) for step, v, y in pairs]
         power = sum(float(y @ y) for _, _, y in fewer)
-        late = [(lagged(v, lag / step), y) for step, v, y in fewer]
+        late = [(apply_lag(v, lag / step), y) for step, v, y in fewer]
         products = [
             sum(float(x[: x.size - k] @ y[k:]) for x, y in late)
             for k in range(int(SIGN_LATE / every) + 1)
@@ -68,35 +70,35 @@ def likeness(records: Sequence[Record], signals: Sequence[Array], lags: bool) ->
         best = max(best, *whole, *both)
         for alike, half in ((whole, 1), (both, 2)):
             if alike.min(initial=0.0) < worst:
-                worst, reverse = float(alike.min()), [(_means(x, half), y) for x, y in late]
-    if -worst <= SIGN_LEAST:  # then nobody asks what chance would make of it
-        return Likeness(best, -worst, np.inf)
+                worst, reverse = float(alike.min()), [(_average(x, half), y) for x, y in late]
+    if -worst <= SIGN_LEAST:  # chance is then irrelevant
+        return SignCorrelation(best, -worst, np.inf)
     sizes = [float(np.sqrt((x @ x) * (y @ y))) for x, y in reverse]
-    spread = [size * _chance(x, y) for size, (x, y) in zip(sizes, reverse, strict=True)]
+    spread = [size * _compute_chance_std(x, y) for size, (x, y) in zip(sizes, reverse, strict=True)]
     chance = float(np.linalg.norm(spread)) / (sum(sizes) or 1.0)
-    return Likeness(best, -worst, chance)
+    return SignCorrelation(best, -worst, chance)
 
 
-def _smooth(record: Record, signal: Array) -> tuple[float, Array, Array] | None:
+def _average_runs(record: Record, signal: Array) -> tuple[float, Array, Array] | None:
     """Return sampling interval, voltage and signal, both as means over runs that it outlives."""
     known = np.isfinite(signal)
     if known.sum() < 20:
         return None
     step = record.sample_time
     y, there = np.where(known, signal, 0.0), known.astype(np.float64)
-    k, volts = max(1, len(record) // RUNS), record.voltage
-    while k > 1 and 2 * np.square(_means(volts, k)).sum() < np.square(volts).sum():
+    k, volts = max(1, len(record) // MAX_RUNS), record.voltage
+    while k > 1 and 2 * np.square(_average(volts, k)).sum() < np.square(volts).sum():
         k //= 2
-    return step, _means(volts, k), _means(y, k) / np.maximum(_means(there, k), 1e-9 + 0.5 / k)
+    return step, _average(volts, k), _average(y, k) / np.maximum(_average(there, k), 1e-9 + 0.5 / k)
 
 
-def _every(values: Array, k: int) -> Array:
+def _decimate(values: Array, k: int) -> Array:
     """Return the means of k neighbours, one of each k."""
     n = values.size // k * k
     return np.asarray(values[:n].reshape(-1, k) @ np.full(k, 1 / k)) if 1 < k <= n else values
 
 
-def _means(values: Array, k: int) -> Array:
+def _average(values: Array, k: int) -> Array:
     """Return the means of k neighbours, in the places of their last."""
     if k <= 1:
         return values
@@ -105,7 +107,7 @@ def _means(values: Array, k: int) -> Array:
     return sums / k
 
 
-def _chance(v: Array, y: Array) -> float:
+def _compute_chance_std(v: Array, y: Array) -> float:
     """Return the standard deviation of the correlation of two independent signals (Bartlett).
 
     It is the sum of the product of their autocorrelations over n.
@@ -121,7 +123,7 @@ def _chance(v: Array, y: Array) -> float:
 def refuse_lost_sign(records: Sequence[Record], speeds: Sequence[Array], where: str) -> None:
     """Refuse signals whose sign was lost."""
     lowest = min(float(np.nanmin(r.voltage)) for r in records)
-    ways = np.concatenate([_ways(r, w) for r, w in zip(records, speeds, strict=True)])
+    ways = np.concatenate([_sum_travel(r, w) for r, w in zip(records, speeds, strict=True)])
     way, back = float(np.abs(ways).sum()), -float(np.minimum(ways, 0.0).sum())
     if lowest >= 0 and back > BACKWARD * way and way - back > BACKWARD * way:
         raise SignalError(
@@ -129,16 +131,16 @@ def refuse_lost_sign(records: Sequence[Record], speeds: Sequence[Array], where: 
             "is backwards: it has no sign; map its direction with direction=COLUMN, or record a "
             "signed command"
         )
-    if all(_size_of(r) for r in records):
+    if all(_is_magnitude(r) for r in records):
         raise SignalError(
             f"{where}: velocity is never negative although the voltage is, and follows its size: "
             "it has no sign; record a signed speed, the encoder's counts or a direction"
         )
 
 
-def _ways(record: Record, speed: Array) -> Array:
-    """Return the ways of runs of samples; none where its sensor's noise makes one as long."""
-    starts = np.unique(np.linspace(0, speed.size, WAYS, endpoint=False).astype(int))
+def _sum_travel(record: Record, speed: Array) -> Array:
+    """Sum the travel of runs of samples, zero where sensor noise explains it."""
+    starts = np.unique(np.linspace(0, speed.size, TRAVEL_RUNS, endpoint=False).astype(int))
     speed = np.nan_to_num(speed)
     ways = np.add.reduceat(speed, starts)
     squares = np.add.reduceat(np.square(np.diff(speed, prepend=speed[:1])), starts)
@@ -147,7 +149,7 @@ def _ways(record: Record, speed: Array) -> Array:
     return np.where(np.abs(ways) > SIGN_SURE * np.sqrt(squares * share), ways, 0.0)
 
 
-def _size_of(record: Record) -> bool:
+def _is_magnitude(record: Record) -> bool:
     """Tell whether a speed is the magnitude of the motor's response to its voltage."""
     speed, volts = record.velocity, record.voltage
     if speed is None or record.count is not None or record.position is not None:
@@ -156,14 +158,14 @@ def _size_of(record: Record) -> bool:
         return False
     known = np.isfinite(speed)
     found = []
-    for lag in np.geomspace(1.0, max(len(record) / 10, 2.0), ANSWERS):
-        made = lagged(volts, float(lag))[known]
-        found.append([_share(x, speed[known]) for x in (made, np.abs(made))])
+    for lag in np.geomspace(1.0, max(len(record) / 10, 2.0), MAGNITUDE_LAG_COUNT):
+        made = apply_lag(volts, float(lag))[known]
+        found.append([_compute_r_squared(x, speed[known]) for x in (made, np.abs(made))])
     signed, size = np.max(found, axis=0)
     return bool(size > HALF_EXPLAINED and signed < HALF_EXPLAINED * size)
 
 
-def _share(x: Array, y: Array) -> float:
+def _compute_r_squared(x: Array, y: Array) -> float:
     """Return the share of a variance explained by a line."""
     x, y = x - x.mean(), y - y.mean()
     both = float((x @ x) * (y @ y))

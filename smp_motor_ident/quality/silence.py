@@ -12,16 +12,16 @@ from smp_motor_ident._compile import compiled
 from smp_motor_ident.errors import SignalError
 from smp_motor_ident.finding import Finding
 from smp_motor_ident.limits import FEWEST, FLICKER, LEFT_BY_SILENCE, SILENT_SWING
-from smp_motor_ident.quality.lag import lagged
+from smp_motor_ident.quality.lag import apply_lag
 from smp_motor_ident.record import Record
 
-LAGS = 12  # between a sampling interval and a quarter of the record, from which a descent starts
+LAG_COUNT = 12  # between a sampling interval and a quarter of the record
 FRICTIONS = (0.0, 0.1, 0.2, 0.35, 0.5, 0.7)  # of the largest voltage: to what hardly turns
 
 
-def silent(record: Record, where: str) -> None:
+def refuse_silent_sensor(record: Record, where: str) -> None:
     """Refuse a sensor that stops although the voltage would move the motor."""
-    for name, a, b in _silences(record):
+    for name, a, b in _find_silences(record):
         raise SignalError(
             f"{where}: dead encoder, the {name} stays at {getattr(record, name)[a + 1] + 0.0:.6g} "
             f"from t = {record.time[a]:.4g} s to {record.time[b]:.4g} s while the voltage reaches "
@@ -31,12 +31,12 @@ def silent(record: Record, where: str) -> None:
 
 
 def remove_silences(record: Record) -> Record:
-    """Return a record without intervals in which a sensor is silent.
+    """Remove the intervals in which a sensor is silent from a record.
 
     The rest determines the motor, whether the shaft was blocked or the encoder came loose.
     """
     least = LEFT_BY_SILENCE * len(record)
-    while found := next((s for s in _silences(record) if s[2] + 1 < len(record)), None):
+    while found := next((s for s in _find_silences(record) if s[2] + 1 < len(record)), None):
         name, a, b = found
         rows = np.ones(len(record), dtype=np.bool_)
         rows[a:b] = False
@@ -51,12 +51,12 @@ def remove_silences(record: Record) -> Record:
             {"signal": name, "begin": float(begin), "end": float(end)},
             "look for an obstacle of the motor, or for a loose cable of the encoder",
         )
-        record = replace(of_rows(record, rows), findings=(*record.findings, said))
+        record = replace(select_rows(record, rows), findings=(*record.findings, said))
     return record
 
 
-def of_rows(record: Record, rows: Flags) -> Record:
-    """Return some rows of a record, in segments where others are missing."""
+def select_rows(record: Record, rows: Flags) -> Record:
+    """Select rows of a record; a new segment begins behind missing ones."""
     at = np.flatnonzero(rows)
     starts = {0, *(np.flatnonzero(np.diff(at) > 1) + 1), *np.searchsorted(at, record.starts)}
     names = ("time", "voltage", "current", "velocity", "position", "count")
@@ -68,7 +68,7 @@ def of_rows(record: Record, rows: Flags) -> Record:
     )
 
 
-def _silences(record: Record) -> Iterator[tuple[str, int, int]]:
+def _find_silences(record: Record) -> Iterator[tuple[str, int, int]]:
     """Yield each signal's longest silence during which the voltage would move the motor."""
     for name in ("count", "position", "velocity"):
         values = getattr(record, name)
@@ -76,7 +76,7 @@ def _silences(record: Record) -> Iterator[tuple[str, int, int]]:
             continue
         # A speed may well be constant; only at zero does it say that nothing turns.
         moves = values != 0 if name == "velocity" else np.diff(values, prepend=np.nan) != 0
-        moves[list(record.starts)] = True  # what stood in one run says nothing of the next
+        moves[list(record.starts)] = True  # a rest does not extend into the next run
         edges = np.concatenate([[0], np.flatnonzero(moves), [len(record) - 1]])
         longest = int(np.argmax(np.diff(edges)))
         a, b = int(edges[longest]), int(edges[longest + 1])
@@ -85,11 +85,11 @@ def _silences(record: Record) -> Iterator[tuple[str, int, int]]:
         still, rest = record.voltage[a + 1 : b], np.delete(record.voltage, np.arange(a, b))
         if np.abs(still).mean() <= 0.5 * np.abs(rest).mean():
             continue
-        if _swing(record, name, a, b) > SILENT_SWING:
+        if _predict_swing(record, name, a, b) > SILENT_SWING:
             yield name, a, b
 
 
-def _swing(record: Record, name: str, a: int, b: int) -> float:
+def _predict_swing(record: Record, name: str, a: int, b: int) -> float:
     """Return the expected swing of a sensor in a silence, in its smallest steps.
 
     The expectation is that of a motor with lag, winding and friction fitted to the rest of the
@@ -105,7 +105,7 @@ def _swing(record: Record, name: str, a: int, b: int) -> float:
     known[list(record.starts)] = False
     if known.sum() < FEWEST or not levels.size:
         return float("inf")  # nothing says how the motor answers
-    expected, least = _answer(record, speed, known), float(levels.min())
+    expected, least = _predict_speed(record, speed, known), float(levels.min())
     if name == "velocity":
         # Differences of counts flicker, so that their mean resolves less than a step; a rounded
         # speed changes only where the motion crosses to the next level.
@@ -117,7 +117,7 @@ def _swing(record: Record, name: str, a: int, b: int) -> float:
     return float(np.abs(np.add.reduceat(expected[a:b] * step[a:b], turns)).max() / least)
 
 
-def _answer(record: Record, speed: Array, known: Flags) -> Array:
+def _predict_speed(record: Record, speed: Array, known: Flags) -> Array:
     """Return the speed expected from the voltage by a model fitted to the known samples."""
     step, volts = record.sample_time, record.voltage
     top, y = float(np.abs(volts).max()), speed[known]
@@ -125,12 +125,12 @@ def _answer(record: Record, speed: Array, known: Flags) -> Array:
     def run(motor: Array) -> tuple[Array, float]:
         """Return the motion and its sum of squared residuals, for two log lags and friction."""
         lags = np.exp(np.minimum(motor[:2], 50.0)) / step
-        torque = lagged(volts, float(lags[1]))
-        x = _sliding(torque, float(np.exp(-1 / lags[0])), abs(float(motor[2])) * top)
+        torque = apply_lag(volts, float(lags[1]))
+        x = _simulate_friction(torque, float(np.exp(-1 / lags[0])), abs(float(motor[2])) * top)
         size, alike = float(x[known] @ x[known]), float(x[known] @ y)
         return x * (alike / size if size > 0 else 0.0), -(alike**2) / size if size > 0 else 0.0
 
-    lags = np.linspace(np.log(step), np.log(record.duration / 4), LAGS)
+    lags = np.linspace(np.log(step), np.log(record.duration / 4), LAG_COUNT)
     tried = [
         np.array([lag, winding, friction])
         for k, lag in enumerate(lags)
@@ -148,7 +148,7 @@ def _answer(record: Record, speed: Array, known: Flags) -> Array:
 
 
 @compiled
-def _sliding(torque: Array, keeps: float, friction: float) -> Array:
+def _simulate_friction(torque: Array, keeps: float, friction: float) -> Array:
     """Return the speed, in volts, of a motor with one lag and Coulomb friction."""
     out = np.zeros(torque.size)
     for n in range(1, torque.size):

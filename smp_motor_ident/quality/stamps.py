@@ -28,9 +28,9 @@ from smp_motor_ident.limits import (
 )
 from smp_motor_ident.record import Record
 
-_PAUSE = 20_000_000  # shortest silence [ns] that divides arrivals
-BLOCKS = 8
-_LEAST = 50  # samples below which a beat is not looked for
+_MIN_PAUSE_NS = 20_000_000  # between groups of arrivals
+JACKKNIFE_BLOCKS = 8
+_MIN_BEAT_SAMPLES = 50
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,17 +51,17 @@ class Beat:
 
 def find_beat(arrival: Integers) -> Beat | None:
     """Return the regular clock behind arrivals; None without one, or if they are regular."""
-    if arrival.size < _LEAST or np.any(np.diff(arrival) < 0):
+    if arrival.size < _MIN_BEAT_SAMPLES or np.any(np.diff(arrival) < 0):
         return None
     # Pauses divide the arrivals: each part has a phase of its own.
     usual = (arrival[-1] - arrival[0]) / (arrival.size - 1)
-    pause = max(20 * usual, _PAUSE)
+    pause = max(20 * usual, _MIN_PAUSE_NS)
     edges = [0, *(np.flatnonzero(np.diff(arrival) > pause) + 1).tolist(), arrival.size]
     time, periods, deviations, late = arrival.copy(), [], [], []
     for begin, end in pairwise(edges):
-        if end - begin < _LEAST:
+        if end - begin < _MIN_BEAT_SAMPLES:
             return None
-        fitted = _fit(arrival[begin:end])
+        fitted = _fit_beat(arrival[begin:end])
         if fitted is None:
             return None
         time[begin:end] = arrival[begin] + np.rint(fitted[0]).astype(np.int64)
@@ -75,7 +75,7 @@ def find_beat(arrival: Integers) -> Beat | None:
     return Beat(time, period, max(deviations), float(np.median(latency)), repeated)
 
 
-def _fit(arrival: Integers) -> tuple[Array, float, float] | None:
+def _fit_beat(arrival: Integers) -> tuple[Array, float, float] | None:
     """Return the beat's instants from the first arrival [ns], its period and the uncertainty."""
     since = (arrival - arrival[0]).astype(np.float64)
     usual = since[-1] / (since.size - 1)
@@ -87,40 +87,40 @@ def _fit(arrival: Integers) -> tuple[Array, float, float] | None:
     if 4 * window > since.size:
         return None
     number = np.arange(since.size, dtype=np.float64)
-    begins = _edges(since.size, since.size // window)[:-1]
+    begins = _divide_evenly(since.size, since.size // window)[:-1]
     for lost in (0, 1):
         if lost:
-            number += _lost(since, number, window)
+            number += _count_lost(since, number, window)
             if number[-1] - (since.size - 1) > BEAT_LOST * since.size:
                 return None
-        begin, period = _line(number, since)
+        begin, period = _fit_line(number, since)
         latency = since - begin - period * number
         highest_floor = np.minimum.reduceat(latency, begins).max()
         # What arrives late catches up: where the sender is regular the floor stays.
         if period > 0 and highest_floor <= BEAT_FLOOR * period * longest:
-            return begin + period * number, period, _deviation(number, since)
+            return begin + period * number, period, _compute_period_std(number, since)
     return None
 
 
-def _edges(size: int, count: int) -> Integers:
+def _divide_evenly(size: int, count: int) -> Integers:
     """Return where so many parts of about equal length begin, and the end of the last."""
     part = np.arange(count + 1)
     edges: Integers = part * (size // count) + np.minimum(part, size % count)
     return edges
 
 
-def _deviation(number: Array, since: Array) -> float:
+def _compute_period_std(number: Array, since: Array) -> float:
     """Return the standard deviation of the period, by a jackknife that deletes blocks."""
-    parts = np.array_split(np.arange(number.size), BLOCKS)
-    periods = [_line(np.delete(number, part), np.delete(since, part))[1] for part in parts]
-    return float(np.sqrt((BLOCKS - 1) * np.var(periods)))
+    parts = np.array_split(np.arange(number.size), JACKKNIFE_BLOCKS)
+    periods = [_fit_line(np.delete(number, part), np.delete(since, part))[1] for part in parts]
+    return float(np.sqrt((JACKKNIFE_BLOCKS - 1) * np.var(periods)))
 
 
-def _lost(since: Array, number: Array, window: int) -> Array:
+def _count_lost(since: Array, number: Array, window: int) -> Array:
     """Return the number of samples lost up to each: a loss raises the floor by whole periods."""
-    edges = _edges(since.size, since.size // (2 * window))
+    edges = _divide_evenly(since.size, since.size // (2 * window))
     parts = [slice(*ends) for ends in pairwise(edges)][:: max((edges.size - 1) // 200, 1)]
-    period = float(np.median([_line(number[p], since[p])[1] for p in parts]))
+    period = float(np.median([_fit_line(number[p], since[p])[1] for p in parts]))
     lost = np.zeros(since.size)
     if period <= 0:
         return lost
@@ -137,7 +137,7 @@ def _lost(since: Array, number: Array, window: int) -> Array:
 
 
 @compiled
-def _line(number: Array, value: Array) -> tuple[float, float]:
+def _fit_line(number: Array, value: Array) -> tuple[float, float]:
     """Return offset and slope of the line of least sum under the points.
 
     It is the edge of their lower hull that lies above the mean number (Andrew's monotone chain).
@@ -163,23 +163,23 @@ def _line(number: Array, value: Array) -> tuple[float, float]:
     return value[i] - slope * number[i], slope
 
 
-def _rounds(beat: Beat, arrival: Integers) -> bool:
+def _is_rounded(beat: Beat, arrival: Integers) -> bool:
     """Tell whether arrivals are the beat rounded to the multiples that their stamps have."""
     multiple = int(np.gcd.reduce(np.diff(arrival)))
     return int(np.ptp(arrival - beat.time)) <= multiple
 
 
-def moves_on(beat: Beat, arrival: Integers, motion: Array) -> bool:
-    """Return whether a motion was sampled on the beat, rather than when its samples arrived.
+def is_on_beat(beat: Beat, arrival: Integers, motion: Array) -> bool:
+    """Tell whether a motion was sampled on the beat rather than at its arrivals.
 
     A sample whose two instants lie clearly apart on the motion is nearer to the line between its
     neighbours at the true one: a sign test over these samples decides.  Most samples arrive
     punctually and tell nothing, and steps of an encoder are smooth on any regular time.
     """
-    kept, put_back = _off_line(arrival, motion), _off_line(beat.time, motion)
+    kept, put_back = _measure_curvature(arrival, motion), _measure_curvature(beat.time, motion)
     good = np.isfinite(kept + put_back)
     kept, put_back = kept[good], put_back[good]
-    if kept.size < _LEAST // 2:
+    if kept.size < _MIN_BEAT_SAMPLES // 2:
         return False
     nearer = np.minimum(kept, put_back)
     apart = np.abs(kept - put_back) > 2.0 * np.quantile(nearer, 0.95)
@@ -187,7 +187,7 @@ def moves_on(beat: Beat, arrival: Integers, motion: Array) -> bool:
     return bool(votes.sum() > SMOOTHER * np.sqrt(votes.size))
 
 
-def _off_line(time: Integers, value: Array) -> Array:
+def _measure_curvature(time: Integers, value: Array) -> Array:
     """Return the distance of samples from the line between their neighbours; NaN if undefined."""
     since = (time - time[0]).astype(np.float64)
     span = since[2:] - since[:-2]
@@ -196,8 +196,8 @@ def _off_line(time: Integers, value: Array) -> Array:
     return np.asarray(off)
 
 
-def on_beat(record: Record) -> Record:
-    """Return a record with late stamps moved to the sender's beat; others unchanged.
+def move_to_beat(record: Record) -> Record:
+    """Move late stamps of a record to the sender's beat; leave others unchanged.
 
     Irregular stamps may be the true sampling instants: the motion decides, unless they differ by
     their rounding only.
@@ -214,7 +214,7 @@ def on_beat(record: Record) -> Record:
     beat = find_beat(arrival)
     if beat is None:
         return record
-    if not (beat.repeated or _rounds(beat, arrival) or moves_on(beat, arrival, motion)):
+    if not (beat.repeated or _is_rounded(beat, arrival) or is_on_beat(beat, arrival, motion)):
         return record
     period, latency = beat.period * 1e-9, beat.latency * 1e-9
     finding = Finding(
@@ -276,13 +276,13 @@ def merge_bunches(record: Record) -> Record:
     )
 
 
-REGULAR = 0.1  # tolerance of whole multiples of an interval [intervals]
+INTERVAL_TOLERANCE = 0.1  # of whole multiples of an interval
 
 
-def bridged(record: Record) -> Record:
-    """Return a record with the mean of a linearly changing voltage where rows were lost.
+def interpolate_lost_voltage(record: Record) -> Record:
+    """Interpolate the voltage linearly where rows were lost, and average it.
 
-    Of ``m`` intervals the last is held at the next row's voltage: their mean is
+    Over ``m`` intervals, the last held at the next row's voltage, the mean is
     ``v1 + (v2 - v1) (m + 1) / (2 m)``.  Readers of bags have done so.
     """
     step = np.diff(record.time)
@@ -293,7 +293,7 @@ def bridged(record: Record) -> Record:
     usual = [np.median(part) for part in inside] if len(inside) > 1 else [record.sample_time]
     share = step / np.repeat(usual, np.diff(edges))[:-1]
     whole = np.rint(share)
-    regular = np.abs(share - whole) < REGULAR
+    regular = np.abs(share - whole) < INTERVAL_TOLERANCE
     few = (whole > 1) & (whole <= 1 + ROWS_LOST)
     few[np.array(record.starts[1:], dtype=np.int64) - 1] = False
     if not few.any() or not regular.all(where=whole <= 1 + ROWS_LOST):

@@ -14,54 +14,54 @@ import numpy as np
 
 from smp_motor_control.arrays import Array, Flags, Integers
 
-SLOW = 0.02  # of the fastest speed: what stands
-SLIGHT = 1e-3  # of all that it turned: the same of an angle
-LONGER = 3.0  # than a motor takes to turn around
-ROWS = 2  # at least
-QUIET = 8  # rows without voltage and motion
-ON = 0.05  # of the largest voltage
+MAX_REST_SPEED = 0.02  # of the largest speed
+MAX_REST_ANGLE = 1e-3  # of the whole travel
+MIN_REST_RATIO = 3.0  # of a rest to a reversal
+MIN_REST_ROWS = 2
+QUIET_ROWS = 8  # rows without voltage and motion
+MIN_DRIVING_VOLTAGE_SHARE = 0.05  # of the largest voltage
 
 
-def stands(
+def detect_rest_at_start(
     time: Array, output: Array, voltage: Array, starts: Integers, is_angle: bool, quantum: float
 ) -> Flags:
     """Tell for each segment whether the motor is at rest at its beginning, shape (g,)."""
     out = np.zeros(len(starts) - 1, dtype=np.bool_)
-    on = ON * float(np.abs(voltage).max(initial=0.0))
+    on = MIN_DRIVING_VOLTAGE_SHARE * float(np.abs(voltage).max(initial=0.0))
     extent = np.nanmax(output) - np.nanmin(output) if is_angle else np.nanmax(np.abs(output))
-    least = max(1.5 * quantum, (SLIGHT if is_angle else SLOW) * float(extent))
+    least = max(1.5 * quantum, (MAX_REST_ANGLE if is_angle else MAX_REST_SPEED) * float(extent))
     for g, (a, b) in enumerate(itertools.pairwise(starts)):
-        begin = slice(a, a + QUIET)
-        if b - a > QUIET and (np.abs(voltage[begin]) < on).all():
+        begin = slice(a, a + QUIET_ROWS)
+        if b - a > QUIET_ROWS and (np.abs(voltage[begin]) < on).all():
             at_rest = output[a] if is_angle else 0.0
             out[g] = not (np.abs(output[begin] - at_rest) > least).any()
             continue
         driven = b - a > 8 and on > 0 and bool((np.abs(voltage[a + 1 : a + 3]) > on).all())
         known = np.flatnonzero(np.isfinite(output[a:b])) + a
         if driven and known.size > 8:
-            out[g] = _stands(time[known], output[known], is_angle, quantum)
+            out[g] = _begins_at_rest(time[known], output[known], is_angle, quantum)
     return out
 
 
-def _stands(t: Array, y: Array, is_angle: bool, quantum: float) -> bool:
+def _begins_at_rest(t: Array, y: Array, is_angle: bool, quantum: float) -> bool:
     """Tell whether one segment begins with a standstill.
 
-    What starts or turns around at a constant acceleration takes twice as long from one speed to
-    its treble, or from one angle to nine times it, as it took to get there.
+    At a constant acceleration, the time from one speed to its treble, or from one angle to nine
+    times it, is twice the time before.
     """
     if is_angle:
         away, treble = np.abs(y - y[0]), 9.0
-        slight = SLIGHT * float(np.ptp(y))
+        slight = MAX_REST_ANGLE * float(np.ptp(y))
         # A fine counter shows a standstill that a thousandth of the travel would hide.
         nears = [1.5 * quantum, max(1.5 * quantum, slight)]
     else:
         away, treble = np.abs(y), 3.0
-        if int(np.argmax(away > SLOW * away.max())) < ROWS:  # faster than slow motion
+        if int(np.argmax(away > MAX_REST_SPEED * away.max())) < MIN_REST_ROWS:
             return False
-        nears = [SLOW * float(np.quantile(away, 0.98))]
+        nears = [MAX_REST_SPEED * float(np.quantile(away, 0.98))]
     for near in nears:
         left, gone = int(np.argmax(away > near)), int(np.argmax(away > treble * near))
-        waits = float(t[left] - t[0]) > LONGER * 0.5 * float(t[gone] - t[left])
-        if near > 0 and gone >= left >= ROWS and waits:
+        waits = float(t[left] - t[0]) > MIN_REST_RATIO * 0.5 * float(t[gone] - t[left])
+        if near > 0 and gone >= left >= MIN_REST_ROWS and waits:
             return True
     return False

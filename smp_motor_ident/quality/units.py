@@ -29,14 +29,14 @@ RATIOS = {
     1000.0: "in thousandths of the other's unit",
 }
 """Possible units of a speed and an angle that differ by such a factor."""
-EXACT = 0.01  # relative tolerance of a ratio of units; ratios of gears usually differ by more
+RATIO_TOLERANCE = 0.01  # relative; gear ratios usually differ by more
 
 
-def cause_of_ratio(ratio: float, hardware: Hardware) -> str:
+def explain_ratio(ratio: float, hardware: Hardware) -> str:
     """Return the cause of a ratio between a speed and the slope of its angle, with advice."""
     for size, words in RATIOS.items():
         for factor, to in ((size, "the speed is"), (1 / size, "the angle is")):
-            if abs(ratio / factor - 1) < EXACT:
+            if abs(ratio / factor - 1) < RATIO_TOLERANCE:
                 return f"{to} {words}: map it with its unit, such as velocity=COLUMN:rpm"
     return (
         f"wrong gear ratio (now {hardware.gear_ratio:g}) or counts per revolution (now "
@@ -44,12 +44,12 @@ def cause_of_ratio(ratio: float, hardware: Hardware) -> str:
     )
 
 
-def one_unit_of_time(records: Sequence[Record]) -> None:
+def refuse_mixed_time_units(records: Sequence[Record]) -> None:
     """Refuse records whose sampling intervals differ by a factor of a thousand."""
     usual = median_low([r.sample_time for r in records])
     for record in records:
         for factor in (1e-6, 1e-3, 1e3, 1e6):
-            if abs(record.sample_time / usual / factor - 1) < EXACT:
+            if abs(record.sample_time / usual / factor - 1) < RATIO_TOLERANCE:
                 raise SignalError(
                     f"{record.source or 'a record'}: a sample every {record.sample_time:.3g} s, "
                     f"{factor:g} times as long as in the other recordings: the time of one is in "
@@ -57,7 +57,7 @@ def one_unit_of_time(records: Sequence[Record]) -> None:
                 )
 
 
-def implausible_voltage(records: Sequence[Record]) -> list[Finding]:
+def check_voltage(records: Sequence[Record]) -> list[Finding]:
     """Return findings on voltages beyond those of robots, especially whole numbers.
 
     The mean of two whole numbers over an interval is a whole or half number.
@@ -80,7 +80,7 @@ def implausible_voltage(records: Sequence[Record]) -> list[Finding]:
     ]
 
 
-def implausible_motor(
+def check_plausibility(
     records: Sequence[Record], gain: float, lag: float, friction: float
 ) -> Iterator[Finding]:
     """Report impossible or implausible motors, which indicate wrong units."""

@@ -18,7 +18,7 @@ from smp_motor_ident.simulate.lanes import (
 
 
 @inlined
-def _fast_decay(te: float, command: float, emf: float, supply: float) -> float:
+def _average_fast_decay(te: float, command: float, emf: float, supply: float) -> float:
     """Return the mean voltage of a bridge that is off for the rest of each PWM period [V].
 
     The current that rose meanwhile falls against the supply through the diodes until it is zero or
@@ -46,7 +46,7 @@ def terminal_voltage(
         out += lane[FREE] * emf
         return out
     if lane[DECAY] > 0.0:
-        out = _fast_decay(lane[DECAY], out, emf, full_duty)
+        out = _average_fast_decay(lane[DECAY], out, emf, full_duty)
     drive: float = out - emf
     if lane[SAG] != 0.0:
         duty = command / full_duty

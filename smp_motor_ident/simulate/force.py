@@ -15,7 +15,7 @@ from smp_motor_ident.simulate.lanes import (
     STRIBECK_SPEED,
 )
 
-SOON = 0.01  # share of the record within which a load sets in
+LOAD_ONSET_SHARE = 0.01  # of the record, within which a load sets in
 
 
 @compiled
@@ -26,5 +26,7 @@ def extra_force(w: float, dry: float, age: float, lane: Array) -> float:
         r = w / lane[STRIBECK_SPEED]
         f += dry * lane[STRIBECK] * math.exp(-r * r)
     if lane[LOAD_STEP] != 0.0:
-        f += lane[LOAD_STEP] * min(max((age - lane[LOAD_STEP_AT]) / SOON + 0.5, 0.0), 1.0)
+        f += lane[LOAD_STEP] * min(
+            max((age - lane[LOAD_STEP_AT]) / LOAD_ONSET_SHARE + 0.5, 0.0), 1.0
+        )
     return f

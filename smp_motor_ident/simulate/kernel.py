@@ -32,14 +32,16 @@ from smp_motor_ident.simulate.lanes import (
     K,
 )
 
-ENTRIES = 12  # of a transition: of q, w and th at its end by q, w, voltage and force
-UNITS = ((1.0, 0.0, 0.0, 0.0), (0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0), (0.0, 0.0, 0.0, 1.0))
-EVENTS = 60  # of friction within one piece, at most
-STUCK = 0.0
+TRANSITION_ENTRIES = 12  # of a transition: of q, w and th at its end by q, w, voltage and force
+BASIS = ((1.0, 0.0, 0.0, 0.0), (0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0), (0.0, 0.0, 0.0, 1.0))
+MAX_EVENTS_PER_PIECE = 60  # of friction
+STUCK_DIRECTION = 0.0
 
 
 @inlined
-def _exponential(te: float, tm: float, k: float, be: float, h: float) -> tuple[float, float, float]:
+def _exponentiate(
+    te: float, tm: float, k: float, be: float, h: float
+) -> tuple[float, float, float]:
     """Return c, s and the mean rate of ``exp(A h) = c I + s (A - rate I)``."""
     a00, a11 = -1.0 / te, -be / tm
     rate = 0.5 * (a00 + a11)
@@ -57,7 +59,7 @@ def _exponential(te: float, tm: float, k: float, be: float, h: float) -> tuple[f
 
 
 @inlined
-def _flow(
+def _propagate(
     q: float, w: float, h: float, v: float, f: float, te: float, tm: float, k: float, be: float
 ) -> tuple[float, float, float]:
     """Return q, w and the change of th after ``h`` at constant voltage and force."""
@@ -66,7 +68,7 @@ def _flow(
         w1 = w_end + (w - w_end) * math.exp(-h * (k + be) / tm)
         return v - k * w1, w1, ((v - f) * h - tm * (w1 - w)) / (k + be)
     q_end = be * w_end + f
-    c, s, rate = _exponential(te, tm, k, be, h)
+    c, s, rate = _exponentiate(te, tm, k, be, h)
     dq, dw = q - q_end, w - w_end
     q1 = q_end + c * dq + s * ((-1.0 / te - rate) * dq - k / te * dw)
     w1 = w_end + c * dw + s * (dq / tm + (-be / tm - rate) * dw)
@@ -79,24 +81,24 @@ def transitions(lengths: Array, lanes: Array) -> Array:
 
     ``lengths`` has shape (lengths, lanes) [s].
     """
-    out = np.empty((lanes.shape[1], lengths.shape[0], ENTRIES))
+    out = np.empty((lanes.shape[1], lengths.shape[0], TRANSITION_ENTRIES))
     for b in range(lanes.shape[1]):
         te, tm, k, be = lanes[TE, b], lanes[TM, b], lanes[K, b], lanes[BE, b]
         for n in range(lengths.shape[0]):
             h = lengths[n, b]
-            for at, (q, w, v, f) in enumerate(UNITS):
-                q1, w1, th = _flow(q, w, h, v, f, te, tm, k, be)
+            for at, (q, w, v, f) in enumerate(BASIS):
+                q1, w1, th = _propagate(q, w, h, v, f, te, tm, k, be)
                 out[b, n, at], out[b, n, at + 4], out[b, n, at + 8] = q1, w1, th
     return out
 
 
 @compiled
-def _crossing(
+def _find_zero_crossing(
     q: float, w: float, h: float, v: float, f: float, direction: float,
     te: float, tm: float, k: float, be: float,
 ) -> float:  # fmt: skip
     """Return when within ``h`` the speed first crosses zero, or -1."""
-    q1, w1, _ = _flow(q, w, h, v, f, te, tm, k, be)
+    q1, w1, _ = _propagate(q, w, h, v, f, te, tm, k, be)
     low, high = 0.0, h
     if w1 * direction >= 0.0:
         # It may dip through zero and come back: then its slope changes sign inside.
@@ -108,7 +110,7 @@ def _crossing(
             return -1.0
         for _ in range(60):
             middle = 0.5 * (low + high)
-            qm, wm, _ = _flow(q, w, middle, v, f, te, tm, k, be)
+            qm, wm, _ = _propagate(q, w, middle, v, f, te, tm, k, be)
             if wm * direction < 0.0:
                 high = middle
                 break
@@ -122,7 +124,7 @@ def _crossing(
     # Safeguarded Newton between a time before and one after the crossing.
     t = 0.5 * (low + high)
     for _ in range(80):
-        qm, wm, _ = _flow(q, w, t, v, f, te, tm, k, be)
+        qm, wm, _ = _propagate(q, w, t, v, f, te, tm, k, be)
         if wm * direction < 0.0:
             high = t
         else:
@@ -146,8 +148,8 @@ def _advance(
     ``hold``: friction at standstill over that in motion.
     """
     left = h
-    for _ in range(EVENTS):
-        if direction == STUCK:
+    for _ in range(MAX_EVENTS_PER_PIECE):
+        if direction == STUCK_DIRECTION:
             drive, end = (q if te > 0.0 else v) - load, v - load
             if -minus * hold <= end <= plus * hold:  # friction holds it whatever the time
                 q = v + (q - v) * math.exp(-left / te) if te > 0.0 else v
@@ -158,22 +160,22 @@ def _advance(
             if te > 0.0 and direction * (limit - drive) > 0.0:
                 wait = -te * math.log((limit - end) / (drive - end))
             if wait >= left:
-                direction = STUCK
+                direction = STUCK_DIRECTION
                 q = v + (q - v) * math.exp(-left / te)
                 break
             if te > 0.0:
                 q = v + (q - v) * math.exp(-wait / te)
             left -= wait
         f = load + (plus if direction > 0.0 else -minus)
-        t = _crossing(q, w, left, v, f, direction, te, tm, k, be)
+        t = _find_zero_crossing(q, w, left, v, f, direction, te, tm, k, be)
         span = left if t < 0.0 else t
-        q, w, turned = _flow(q, w, span, v, f, te, tm, k, be)
+        q, w, turned = _propagate(q, w, span, v, f, te, tm, k, be)
         th += turned
         if t < 0.0:
             break
         w = 0.0
         net = (q if te > 0.0 else v) - load
-        direction = 1.0 if net > plus * hold else -1.0 if net < -minus * hold else STUCK
+        direction = 1.0 if net > plus * hold else -1.0 if net < -minus * hold else STUCK_DIRECTION
         left -= t
         if left <= 1e-14 * h:
             break
@@ -181,7 +183,7 @@ def _advance(
 
 
 @compiled
-def run(  # noqa: C901 - one pass, kept whole so that nothing is stored between its steps
+def simulate_rows(  # noqa: C901 - one pass, kept whole so that nothing is stored between its steps
     first_piece: Integers,
     length: Array,
     edges: Integers,
@@ -258,30 +260,30 @@ def run(  # noqa: C901 - one pass, kept whole so that nothing is stored between 
                         u = v
                         v = terminal_voltage(u, k * w, passed, full_duty, lane)
                         force = load + extra_force(w, dry, passed, lane)
-                        if direction != STUCK or not friction:
+                        if direction != STUCK_DIRECTION or not friction:
                             f = force + dry
                             if kind >= 0:
-                                middle = _after(halves, b, kind, 4, q, w, v, f)
+                                middle = _apply_transition(halves, b, kind, 4, q, w, v, f)
                             else:
-                                _, middle, _ = _flow(q, w, 0.5 * h, v, f, te, tm, k, be)
+                                _, middle, _ = _propagate(q, w, 0.5 * h, v, f, te, tm, k, be)
                             if friction and middle * direction < 0.0:
                                 middle = 0.0
                             v = terminal_voltage(u, k * middle, passed, full_duty, lane)
                             force = load + extra_force(middle, dry, passed, lane)
                     put += h * v
                     gathered += h
-                    if friction and direction == STUCK:
+                    if friction and direction == STUCK_DIRECTION:
                         q, w, th, direction = _advance(
                             q, w, th, direction, h, v, force, plus, minus, hold, te, tm, k, be
                         )
                         continue
                     f = force + dry
                     if kind >= 0:
-                        q1 = _after(tables, b, kind, 0, q, w, v, f)
-                        w1 = _after(tables, b, kind, 4, q, w, v, f)
-                        th1 = th + _after(tables, b, kind, 8, q, w, v, f)
+                        q1 = _apply_transition(tables, b, kind, 0, q, w, v, f)
+                        w1 = _apply_transition(tables, b, kind, 4, q, w, v, f)
+                        th1 = th + _apply_transition(tables, b, kind, 8, q, w, v, f)
                     else:
-                        q1, w1, turned = _flow(q, w, h, v, f, te, tm, k, be)
+                        q1, w1, turned = _propagate(q, w, h, v, f, te, tm, k, be)
                         th1 = th + turned
                     # A dip through zero needs a speed that the first slope uses up.
                     if friction and (
@@ -301,11 +303,11 @@ def run(  # noqa: C901 - one pass, kept whole so that nothing is stored between 
 
 @inlined
 def _sign(w: float) -> float:
-    return 1.0 if w > 0.0 else -1.0 if w < 0.0 else STUCK
+    return 1.0 if w > 0.0 else -1.0 if w < 0.0 else STUCK_DIRECTION
 
 
 @inlined
-def _after(
+def _apply_transition(
     tables: Array, b: int, kind: int, at: int, q: float, w: float, v: float, f: float
 ) -> float:
     """Return one output of a tabulated transition."""

@@ -9,10 +9,10 @@ import numpy as np
 
 from smp_motor_control.arrays import Array
 from smp_motor_ident.simulate import lanes as at
-from smp_motor_ident.simulate.kernel import run, transitions
+from smp_motor_ident.simulate.kernel import simulate_rows, transitions
 from smp_motor_ident.simulate.rows import Pieces, Rows
 
-FEEDBACK = (
+FEEDBACK_PARAMETERS = (
     at.SAG, at.DROP, at.CURRENT_LIMIT, at.DECAY, at.FREE, at.DECLINE, at.DRAG, at.STRIBECK,
     at.FRICTION_DRIFT, at.LOAD_STEP,
 )  # fmt: skip
@@ -32,7 +32,7 @@ class Motion:
 
 def follows_motion(lanes: Array) -> bool:
     """Tell whether any lane's voltage or force follows the motion."""
-    return any((lanes[k] != at.NEUTRAL[k]).any() for k in FEEDBACK)
+    return any((lanes[k] != at.NEUTRAL[k]).any() for k in FEEDBACK_PARAMETERS)
 
 
 def simulate(
@@ -85,7 +85,7 @@ def simulate(
         age = np.repeat(rows.age, np.diff(pieces.first))
     out = np.empty((3, count, len(rows)))
     volts = np.zeros((count, len(rows) if charge else 0))
-    run(
+    simulate_rows(
         pieces.first, pieces.length, pieces.edges, pieces.group, pieces.section,
         np.ascontiguousarray(command.T), tables, halves, np.ascontiguousarray(lanes), moved,
         rows.segment, initial, added, friction, feedback, full_duty, age, out, volts,

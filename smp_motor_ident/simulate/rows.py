@@ -11,9 +11,9 @@ import numpy as np
 from smp_motor_control.arrays import Array, Integers
 from smp_motor_ident._compile import compiled
 
-MOST_KEPT = 4  # ways of cutting that are kept
-MOST_GROUPS = 48  # lengths of pieces whose transitions are tabulated
-SAME = 1e-9  # relative difference of two lengths that are one
+MAX_CACHED_CUTS = 4
+MAX_LENGTH_GROUPS = 48  # of pieces whose transitions are tabulated
+LENGTH_TOLERANCE = 1e-9  # relative, of equal lengths
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,7 +41,7 @@ class Rows:
     begin: Array  # shape (s,), [s]: when each section begins; ignored of the first of a segment
     command: Array  # shape (s,), [V]
     section: Integers  # shape (g + 1,): first section of every segment, and s
-    _kept: dict[tuple[float, float, bool], Pieces] = field(default_factory=dict)
+    _cache: dict[tuple[float, float, bool], Pieces] = field(default_factory=dict)
 
     @classmethod
     def held(cls, time: Array, voltage: Array, segment: Integers) -> Rows:
@@ -82,18 +82,18 @@ class Rows:
         ``longest``: length [s] of a piece at most.  ``moving``: whether delays differ by lane.
         """
         key = delay, longest, moving
-        if key not in self._kept:
-            if len(self._kept) >= MOST_KEPT:
-                self._kept.pop(next(iter(self._kept)))
-            self._kept[key] = self._pieces(delay, longest, moving)
-        return self._kept[key]
+        if key not in self._cache:
+            if len(self._cache) >= MAX_CACHED_CUTS:
+                self._cache.pop(next(iter(self._cache)))
+            self._cache[key] = self._pieces(delay, longest, moving)
+        return self._cache[key]
 
     def _pieces(self, delay: float, longest: float, moving: bool) -> Pieces:
         n = len(self)
         cut = not self.plain or delay != 0.0 or moving
         section, length, edges, count = self._cut(delay) if cut else self._uncut()
         if np.isfinite(longest):
-            parts = np.maximum(np.ceil(length / longest - SAME), 1).astype(np.int64)
+            parts = np.maximum(np.ceil(length / longest - LENGTH_TOLERANCE), 1).astype(np.int64)
             if parts.max() > 1:
                 row = np.repeat(np.repeat(np.arange(n), count), parts)
                 # The shift of a lane belongs to the part next to the switch.
@@ -103,7 +103,7 @@ class Rows:
                 section, length = np.repeat(section, parts), np.repeat(length / parts, parts)
                 count = np.bincount(row, minlength=n)
         first = np.concatenate([[0], np.cumsum(count)])
-        group, grouped, grouped_edges = _groups(length, edges, self.step)
+        group, grouped, grouped_edges = _group_pieces(length, edges, self.step)
         return Pieces(first, length, edges, group, section, grouped, grouped_edges)
 
     def _uncut(self) -> tuple[Integers, Array, Integers, Integers]:
@@ -134,7 +134,7 @@ def _cut_rows(
         at = first_section[g]  # of the command that acts
         for row in range(segment[g], segment[g + 1]):
             gone = time[row] - interval[row]
-            slack = SAME * interval[row]  # a switch at a row belongs to the next
+            slack = LENGTH_TOLERANCE * interval[row]  # a switch at a row belongs to the next
             while at + 1 < first_section[g + 1] and begin[at + 1] + delay < gone - slack:
                 at += 1
             before = made
@@ -154,21 +154,21 @@ def _cut_rows(
     return made
 
 
-def _groups(length: Array, edges: Integers, step: float) -> tuple[Integers, Array, Integers]:
+def _group_pieces(length: Array, edges: Integers, step: float) -> tuple[Integers, Array, Integers]:
     """Return the group of every piece and the length and edges of each; none where all differ."""
     low, high = float(length.min()), float(length.max())
-    if high - low <= SAME * step and not edges.any():
+    if high - low <= LENGTH_TOLERANCE * step and not edges.any():
         return np.zeros(length.size, dtype=np.int64), np.array([length[0]]), np.zeros(1, np.int64)
-    kind = np.round(length / (SAME * 10 * step)).astype(np.int64) * 4 + edges + 1
+    kind = np.round(length / (LENGTH_TOLERANCE * 10 * step)).astype(np.int64) * 4 + edges + 1
     _, seen = np.unique(kind[:: max(length.size // 2000, 1)], return_counts=True)
-    if np.sort(seen)[-MOST_GROUPS:].sum() < 0.5 * seen.sum():
+    if np.sort(seen)[-MAX_LENGTH_GROUPS:].sum() < 0.5 * seen.sum():
         return np.full(length.size, -1), np.zeros(0), np.zeros(0, dtype=np.int64)
     kinds, index, group, count = np.unique(
         kind, return_index=True, return_inverse=True, return_counts=True
     )
-    if kinds.size <= MOST_GROUPS:
+    if kinds.size <= MAX_LENGTH_GROUPS:
         return group.astype(np.int64), length[index], edges[index]
-    often = np.sort(np.argsort(-count, kind="stable")[:MOST_GROUPS])
+    often = np.sort(np.argsort(-count, kind="stable")[:MAX_LENGTH_GROUPS])
     place = np.full(kinds.size, -1)
     place[often] = np.arange(often.size)
     return place[group], length[index[often]], edges[index[often]]

@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from smp_motor_ident.chain.catalogue import chain_from
-from smp_motor_ident.chain.terminal import Driver, driver_of, put_out
+from smp_motor_ident.chain.catalogue import rebuild_chain
+from smp_motor_ident.chain.terminal import Driver, apply_driver, make_driver
 from smp_motor_ident.errors import DesignError
 from smp_motor_ident.finding import Finding
 from smp_motor_ident.result import Estimate
@@ -81,7 +81,7 @@ class Case:
         """Least command [V] at which the motor must turn, whatever load there is; the supply's."""
         commands = np.linspace(0.0, self.problem.loop.supply_voltage, 256)
         numbers, lane = self.driver.numbers, self.driver.lane
-        volts = [put_out(numbers, lane, v, 0.0, v, 1.0)[0] for v in commands.tolist()]
+        volts = [apply_driver(numbers, lane, v, 0.0, v, 1.0)[0] for v in commands.tolist()]
         enough = int(np.searchsorted(volts, self.friction.planned + self.load))
         return float(commands[min(enough, commands.size - 1)])
 
@@ -90,8 +90,8 @@ def prepare(estimate: Estimate, loop: Loop, method: str, targets: dict[str, Any]
     """Sample the motor and the draws of its distribution; see :func:`design`."""
     chosen = _method(method, targets)
     findings = list(_check_reliability(estimate, bool(targets.get("accept_unreliable"))))
-    driver = driver_of(
-        chain_from(estimate.chain),
+    driver = make_driver(
+        rebuild_chain(estimate.chain),
         estimate.largest_voltage,
         estimate.hardware.supply_voltage or 0.0,
     )

@@ -15,12 +15,12 @@ from numpy.typing import NDArray
 from smp_motor_control.arrays import Array
 from smp_motor_control.observer import DISTRUST_RATIO, INNOVATION_MEMORY_S
 from smp_motor_ident._compile import compiled
-from smp_motor_ident.chain.terminal import Driver, no_driver, put_out
+from smp_motor_ident.chain.terminal import Driver, apply_driver, make_ideal_driver
 from smp_motor_ident.limits import SETTLING_BAND
 from smp_motor_ident.tune.feedback import Feedback
 from smp_motor_ident.tune.plant import NO_OBSERVER, SPEED, Plant
 
-NO_EFFECT = no_driver()
+NO_EFFECT = make_ideal_driver()
 
 
 @dataclass(frozen=True, eq=False)
@@ -216,7 +216,7 @@ def _run(
             for q in range(m - 1, 0, -1):
                 past[q], given_out[q] = past[q - 1], given_out[q - 1]
             past[0] = given
-            given_out[0], last = put_out(driver, lane, given, back_emf[j] * x[0], last, T)
+            given_out[0], last = apply_driver(driver, lane, given, back_emf[j] * x[0], last, T)
             drag = _drag(x[0], friction[j], given_out, taps_angle[j], load[j, k])
             swept = 0.0
             following[:] = 0.0

@@ -11,8 +11,8 @@ from scipy.signal import lfilter
 from smp_motor_ident.errors import InsufficientExcitationError, SignalError
 from smp_motor_ident.estimate import estimate
 from smp_motor_ident.infer.planning import what_next
-from smp_motor_ident.quality.screen import screen
-from smp_motor_ident.quality.units import one_unit_of_time
+from smp_motor_ident.quality.screen import screen_records
+from smp_motor_ident.quality.units import refuse_mixed_time_units
 from smp_motor_ident.record import Record
 
 GOOD = motors.record("rear_left", seconds=4.0)
@@ -75,7 +75,7 @@ def test_a_speed_that_settles_on_its_resolution_is_not_saturated(late):
     """To a tenth of a rad/s it rests within 40 samples of each step, and late until the next."""
     level = np.repeat([3.0, 8.0, 5.0, 8.0, 2.0, 8.0, 0.0, 6.0], 40)
     speed = lfilter([0.5], [1.0, -0.5], np.roll(level, late) * 25.0)
-    screen([Record("motor", np.arange(320) / 50.0, level, velocity=np.round(speed, 1))])
+    screen_records([Record("motor", np.arange(320) / 50.0, level, velocity=np.round(speed, 1))])
 
 
 def test_a_peak_that_is_held_for_some_rows_is_not_saturated():
@@ -83,13 +83,13 @@ def test_a_peak_that_is_held_for_some_rows_is_not_saturated():
     level = np.repeat([3.0, 8.0, 5.0, 2.0, 6.0], 60) + np.linspace(0.0, 1.0, 300)
     speed = 25.0 * level + np.random.default_rng(4).normal(0.0, 2.0, 300)
     speed[100:106] = speed.max() + 20.0
-    screen([Record("motor", np.arange(300) / 100.0, level, velocity=speed)])
+    screen_records([Record("motor", np.arange(300) / 100.0, level, velocity=speed)])
 
 
 def test_one_level_of_voltage_is_not_saturation():
     speed = np.round(8.0 * 25.0 * (1 - np.exp(-np.arange(300) / 30)), 1)
     level = np.r_[np.zeros(20), np.full(280, 8.0)]
-    screen([Record("motor", np.arange(300) / 100.0, level, velocity=speed)])
+    screen_records([Record("motor", np.arange(300) / 100.0, level, velocity=speed)])
 
 
 def test_a_voltmeter_that_scatters_around_a_level_is_a_constant_input():
@@ -116,7 +116,7 @@ def test_a_speed_that_a_filter_makes_late_and_small_has_the_gear_ratio_of_its_an
     slow = np.zeros(N)
     for n in range(1, N):
         slow[n] = slow[n - 1] + (GOOD.velocity[n] - slow[n - 1]) * 0.005 / 0.035
-    screen([replace(GOOD, current=None, velocity=slow)])
+    screen_records([replace(GOOD, current=None, velocity=slow)])
 
 
 @pytest.mark.parametrize("offset", [0.0, 1.2])
@@ -166,7 +166,7 @@ def test_a_speed_that_is_an_angles_slope_in_another_unit_names_both(speed, angle
     turned = np.cumsum(GOOD.velocity) * np.median(np.diff(GOOD.time))
     mixed = replace(GOOD, count=None, velocity=speed * GOOD.velocity, position=angle * turned)
     with pytest.raises(SignalError, match=words):
-        screen([mixed])
+        screen_records([mixed])
 
 
 def _coarse(record: Record, counts: float, samples: int) -> Record:
@@ -203,11 +203,13 @@ def test_a_record_in_another_unit_of_time_is_named_among_others():
     milliseconds = replace(GOOD, time=1000.0 * GOOD.time, source="third.csv")
     for others in ([GOOD], [GOOD, GOOD]):
         with pytest.raises(SignalError, match=r"third\.csv: a sample every 5 s, 1000 times.*:ms"):
-            screen([*others, milliseconds])
-    one_unit_of_time([GOOD, replace(GOOD, time=100.0 * GOOD.time)])  # 2 Hz and 200 Hz are plausible
+            screen_records([*others, milliseconds])
+    refuse_mixed_time_units(
+        [GOOD, replace(GOOD, time=100.0 * GOOD.time)]
+    )  # 2 Hz and 200 Hz are plausible
 
 
 def test_a_record_at_rest_does_not_decide_the_sign_of_others():
     """Its speed is an offset of the sensor, which runs against a voltage of the other sign."""
     still = replace(GOOD, voltage=np.full(N, 0.4), count=None, velocity=np.full(N, -1e-4))
-    screen([replace(GOOD, count=None), still])
+    screen_records([replace(GOOD, count=None), still])

@@ -7,7 +7,11 @@ import numpy as np
 from motors import check
 
 from smp_motor_ident.estimate import estimate
-from smp_motor_ident.quality.differenced import counts_again, over_real_intervals, rounding
+from smp_motor_ident.quality.differenced import (
+    correct_nominal_period,
+    read_count_rounding,
+    recover_counts,
+)
 from smp_motor_ident.record import Hardware, Record
 
 GAIN, LAG, STEP, TURN = 40.0, 0.03, 0.001, 2 * np.pi / 48
@@ -37,7 +41,7 @@ def looped(samples: int = 8000, over: int = 1) -> Record:
 
 def test_a_speed_of_differenced_counts_is_estimated_without_bias_in_a_loop():
     record = looped()
-    (summed,) = counts_again([record])
+    (summed,) = recover_counts([record])
     moved = np.diff(summed.position) / TURN
     np.testing.assert_allclose(moved, np.rint(moved), atol=1e-6)  # rounding of a sum of thousands
     np.testing.assert_allclose(np.diff(summed.position) / STEP, record.velocity[1:], atol=1e-6)
@@ -52,25 +56,25 @@ def test_counts_are_detected_in_the_speed_of_an_unmodelled_motor():
     speed = np.where(t < 1.5, 1 - np.exp(-t / 0.05), np.exp(-(t - 1.5)) * np.cos(3 * t))
     count = np.floor(np.cumsum(60.0 * speed) * STEP / TURN)
     record = Record("motor", t, 6.0 * (t < 1.5), velocity=np.diff(count, prepend=0) * TURN / STEP)
-    (summed,) = counts_again([record])
+    (summed,) = recover_counts([record])
     np.testing.assert_allclose(summed.position / TURN, count, atol=1e-6)
 
 
 def test_a_speed_over_several_samples_is_not_a_difference_of_neighbouring_counts():
     record = looped(over=4)
-    assert counts_again([record])[0] is record and rounding(record) == 0.0
-    assert counts_again([looped(), record])[1] is record  # and none of the others is
+    assert recover_counts([record])[0] is record and read_count_rounding(record) == 0.0
+    assert recover_counts([looped(), record])[1] is record  # and none of the others is
 
 
 def test_speeds_with_lost_samples_or_values_are_not_summed():
     record = looped()
     lost = np.delete(np.arange(len(record)), 500)
     gap = Record("motor", record.time[lost], record.voltage[lost], velocity=record.velocity[lost])
-    assert counts_again([gap])[0] is gap
+    assert recover_counts([gap])[0] is gap
     broken = record.velocity.copy()
     broken[500] = np.nan
     missing = replace(record, velocity=broken)
-    assert counts_again([missing])[0] is missing
+    assert recover_counts([missing])[0] is missing
 
 
 PERIOD = 0.0115
@@ -96,10 +100,10 @@ def late_loop(per_turn: float | None, nominal: bool) -> Record:
 
 
 def test_counts_over_a_nominal_period_are_a_speed_over_the_real_intervals():
-    put_right = over_real_intervals(late_loop(48.0, nominal=True))
+    put_right = correct_nominal_period(late_loop(48.0, nominal=True))
     real = late_loop(48.0, nominal=False)
     np.testing.assert_allclose(put_right.velocity[1:], real.velocity[1:], rtol=1e-9)
-    assert over_real_intervals(real) is real
+    assert correct_nominal_period(real) is real
     check(estimate(late_loop(48.0, nominal=True)), {"dc_gain": GAIN}, most=0.005)
 
 
@@ -115,4 +119,4 @@ def test_late_stamps_of_a_regular_sensor_are_not_a_nominal_period():
     even = replace(record, time=regular, velocity=GAIN * record.voltage)
     late = np.random.default_rng(3).exponential(0.1 * PERIOD, len(record))
     stamped = replace(even, time=np.maximum.accumulate(regular + late) + 1e-9 * regular)
-    assert over_real_intervals(stamped) is stamped
+    assert correct_nominal_period(stamped) is stamped

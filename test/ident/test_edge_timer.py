@@ -8,7 +8,7 @@ import pytest
 from motors import check
 
 from smp_motor_ident.estimate import estimate
-from smp_motor_ident.quality.edge_timer import between_edges, held_of
+from smp_motor_ident.quality.edge_timer import interpolate_edge_timing, read_held_share
 from smp_motor_ident.record import Hardware, Record
 
 GAIN, LAG, STATIC, STEP, FINE = 40.0, 0.06, 0.4, 0.005, 1e-4
@@ -63,7 +63,7 @@ def recorded(tick: float, per_turn: float | None) -> Record:
 @pytest.mark.parametrize("tick, per_turn", [(1e-6, None), (4e-6, 48.0)])
 def test_values_held_by_an_edge_timer_are_not_a_dead_zone(tick, per_turn):
     record = recorded(tick, per_turn)
-    (said,) = [f for f in between_edges(record).findings if f.code == "edge_timer"]
+    (said,) = [f for f in interpolate_edge_timing(record).findings if f.code == "edge_timer"]
     assert said.evidence["count"] == pytest.approx(COUNT, rel=0.25)  # by how it is held: to a row
     found = estimate(record)
     assert "dead_zone" not in found.combinations and not found.unreliable
@@ -88,9 +88,9 @@ def test_a_rounded_or_held_speed_from_counts_is_not_edge_timed():
         for per_turn in (None, 48.0):
             hardware = Hardware(counts_per_revolution=per_turn)
             record = Record("motor", time, volts, velocity=shown, hardware=hardware)
-            assert between_edges(record) is record and held_of(record) == 0.0
+            assert interpolate_edge_timing(record) is record and read_held_share(record) == 0.0
     counted = replace(record, count=counts.astype(np.int64))
-    assert between_edges(counted) is counted
+    assert interpolate_edge_timing(counted) is counted
 
 
 def test_the_tail_of_a_filter_is_not_edge_timed():
@@ -99,7 +99,7 @@ def test_the_tail_of_a_filter_is_not_edge_timed():
     tail = np.array([float(f"{w:.4g}") for w in shown])
     tail[tail < 2e-6] = np.repeat(tail[tail < 2e-6][::3], 3)[: (tail < 2e-6).sum()]
     record = Record("motor", STEP * np.arange(tail.size), np.zeros(tail.size), velocity=tail)
-    assert between_edges(record) is record
+    assert interpolate_edge_timing(record) is record
 
 
 @pytest.mark.parametrize("per_turn", [60, 150, 400])
@@ -111,6 +111,6 @@ def test_friction_is_found_with_an_edge_timer_in_fast_reversals(per_turn):
     hardware = Hardware(counts_per_revolution=float(per_turn))
     record = Record("motor", STEP * np.arange(volts.size), volts, velocity=shown, hardware=hardware)
     true = speed[round(STEP / FINE) - 1 :: round(STEP / FINE)]
-    late, off = shown - true, between_edges(record).velocity - true
+    late, off = shown - true, interpolate_edge_timing(record).velocity - true
     assert np.nanmean(off**2) < 0.1 * np.mean(late**2)  # a third of the size
     check(estimate(record), {"dc_gain": GAIN, "static_voltage": STATIC})

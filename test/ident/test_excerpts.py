@@ -7,7 +7,7 @@ import numpy as np
 from smp_motor_ident.cli.identification import identify_wheel
 from smp_motor_ident.estimate import estimate
 from smp_motor_ident.limits import EXCERPT
-from smp_motor_ident.quality.excitation import STRETCHES, excerpts
+from smp_motor_ident.quality.excitation import STRETCH_COUNT, select_excerpts
 from smp_motor_ident.record import Record
 
 SIGMAS = 4.0  # one of four quantities passes them by chance in 4,000 records; the seed is fixed
@@ -15,15 +15,15 @@ SIGMAS = 4.0  # one of four quantities passes them by chance in 4,000 records; t
 
 def test_a_record_that_is_not_long_is_used_whole() -> None:
     record = motors.record(seconds=2.0)
-    assert excerpts([record, record], 2 * len(record)) == [record, record]
-    assert excerpts([]) == []
+    assert select_excerpts([record, record], 2 * len(record)) == [record, record]
+    assert select_excerpts([]) == []
 
 
 def test_stretches_are_spread_evenly_over_a_long_record() -> None:
     whole = motors.record(seconds=20.0)
-    parts = excerpts([whole], 4_000)
-    assert [len(part) for part in parts] == STRETCHES * [500]
-    begins = np.linspace(0, len(whole) - 500, STRETCHES).astype(int)
+    parts = select_excerpts([whole], 4_000)
+    assert [len(part) for part in parts] == STRETCH_COUNT * [500]
+    begins = np.linspace(0, len(whole) - 500, STRETCH_COUNT).astype(int)
     for part, begin in zip(parts, begins, strict=True):
         assert np.array_equal(part.voltage, whole.voltage[begin : begin + 500])
     (found,) = parts[0].findings[len(whole.findings) :]
@@ -33,12 +33,12 @@ def test_stretches_are_spread_evenly_over_a_long_record() -> None:
 
 def test_records_share_the_rows_by_their_length_and_short_ones_stay_whole() -> None:
     whole = motors.record(seconds=20.0)
-    parts = excerpts([whole, whole.slice(0, 6_000), whole.slice(0, 60)], 4_000)
+    parts = select_excerpts([whole, whole.slice(0, 6_000), whole.slice(0, 60)], 4_000)
     assert [len(part) for part in parts] == [*3 * [885], *3 * [442], 60]
 
 
 def test_the_stretches_of_a_long_record_tell_its_motor() -> None:
-    found = estimate(excerpts([motors.record(seconds=20.0, current=False)], 4_000))
+    found = estimate(select_excerpts([motors.record(seconds=20.0, current=False)], 4_000))
     names = ("dc_gain", "time_constant", "time_constant_product", "static_voltage")
     motors.check(found, motors.truth("rear_left", 0.3), names, sigmas=SIGMAS)
 
@@ -53,4 +53,4 @@ def test_identify_uses_and_shows_stretches_of_a_long_record() -> None:
     outcome = identify_wheel([record], (), "auto", {}, lambda _: None)
     assert [f.code for f in outcome.estimate.findings].count("excerpt") == 1
     motors.check(outcome.estimate, {"dc_gain": 25.0}, sigmas=SIGMAS)
-    assert len(outcome.comparisons) == STRETCHES
+    assert len(outcome.comparisons) == STRETCH_COUNT

@@ -6,7 +6,7 @@ import pytest
 from motors import check, first_order
 
 from smp_motor_ident.estimate import estimate
-from smp_motor_ident.quality.glitches import without_glitches
+from smp_motor_ident.quality.glitches import remove_glitches
 from smp_motor_ident.record import Record
 
 GAIN, TAU, STEP = 25.0, 0.06, 0.01
@@ -47,7 +47,7 @@ def test_numbers_are_right_without_the_glitches_that_are_named(seed, share, size
 @pytest.mark.parametrize("seed", range(5))
 def test_noise_and_fast_motion_are_not_glitches(seed, kind):
     record = recorded(seed, **kind)
-    assert without_glitches(record) is record
+    assert remove_glitches(record) is record
 
 
 @pytest.mark.parametrize("quantum", [0.1, 2.0, 20.0])
@@ -57,7 +57,7 @@ def test_a_speed_in_steps_has_no_glitches(quantum):
         "motor", record.time, record.voltage,
         velocity=quantum * np.round(record.velocity / quantum),
     )  # fmt: skip
-    assert without_glitches(coarse) is coarse
+    assert remove_glitches(coarse) is coarse
 
 
 def test_the_response_to_a_short_pulse_is_not_a_glitch():
@@ -65,7 +65,7 @@ def test_the_response_to_a_short_pulse_is_not_a_glitch():
     voltage[50::100] = 10.0
     speed = np.concatenate([[0.0], GAIN * voltage[:-1]])
     record = Record("motor", STEP * np.arange(1_000), voltage, velocity=speed)
-    assert without_glitches(record) is record
+    assert remove_glitches(record) is record
 
 
 def test_several_in_a_row_are_all_left_out_of_an_angle():
@@ -73,7 +73,7 @@ def test_several_in_a_row_are_all_left_out_of_an_angle():
     angle = np.cumsum(record.velocity) * STEP
     wrong = angle.copy()
     wrong[500], wrong[900:903], wrong[1500] = 900.0, (-700.0, 800.0, 650.0), 0.0
-    cleaned = without_glitches(Record("motor", record.time, record.voltage, position=wrong))
+    cleaned = remove_glitches(Record("motor", record.time, record.voltage, position=wrong))
     lost = np.flatnonzero(~np.isfinite(cleaned.position))
     assert list(lost) == [500, 900, 901, 902, 1500]
     np.testing.assert_array_equal(np.delete(cleaned.position, lost), np.delete(angle, lost))
@@ -81,7 +81,7 @@ def test_several_in_a_row_are_all_left_out_of_an_angle():
 
 def test_a_sensor_that_is_wrong_too_often_is_left_as_it_is():
     record = glitched(recorded(2), 0.15, 700.0)
-    assert without_glitches(record) is record
+    assert remove_glitches(record) is record
 
 
 @pytest.mark.parametrize("lost", [0, 150])

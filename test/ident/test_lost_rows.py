@@ -8,7 +8,7 @@ import pytest
 
 from smp_motor_ident.estimate import estimate
 from smp_motor_ident.finding import Finding
-from smp_motor_ident.quality.stamps import bridged
+from smp_motor_ident.quality.stamps import interpolate_lost_voltage
 from smp_motor_ident.record import Record
 
 GAIN, LAG, FRICTION, RATE = 60.0, 0.014, 1.0, 500.0
@@ -46,7 +46,7 @@ def test_a_command_that_changes_all_the_time_goes_on_changing_in_rows_that_were_
 
 def test_the_mean_of_a_straight_line_is_that_of_its_held_samples():
     t = np.delete(np.arange(60.0), [20, 30, 31])
-    record = bridged(Record("motor", t, t.copy(), velocity=t))
+    record = interpolate_lost_voltage(Record("motor", t, t.copy(), velocity=t))
     own = dict(zip(t, record.voltage, strict=True))
     assert own[21.0] == pytest.approx((20 + 21) / 2)
     assert own[32.0] == pytest.approx((30 + 31 + 32) / 3)
@@ -58,15 +58,15 @@ def test_a_segment_at_another_rate_lost_nothing(begin):
     """One of 2 s a row behind one of 1 s a row; the last of the first may be by itself."""
     t = np.r_[np.arange(40.0), 50.0, 100.0 + 2 * np.arange(30)]
     record = Record("motor", t, t.copy(), velocity=t, starts=tuple(sorted({0, 40, 41, begin})))
-    assert bridged(record) is record
+    assert interpolate_lost_voltage(record) is record
 
 
 def test_complete_or_bridged_records_are_unchanged():
     whole = ramps(0.0)
-    assert bridged(whole) is whole
+    assert interpolate_lost_voltage(whole) is whole
     noted = replace(ramps(0.1), findings=(Finding("samples_missing", "note", "by the reader"),))
-    assert bridged(noted) is noted
+    assert interpolate_lost_voltage(noted) is noted
     jittered = replace(whole, time=whole.time + 0.3 / RATE * np.sin(np.arange(len(whole))))
-    assert bridged(jittered) is jittered
+    assert interpolate_lost_voltage(jittered) is jittered
     long = replace(whole, time=whole.time + 4.0 / RATE * (np.arange(len(whole)) > 900))
-    assert bridged(long) is long
+    assert interpolate_lost_voltage(long) is long

@@ -12,10 +12,10 @@ from scipy.signal import lfilter
 from smp_motor_ident.errors import InsufficientExcitationError, SignalError
 from smp_motor_ident.estimate import estimate
 from smp_motor_ident.fit.data import prepare
-from smp_motor_ident.infer.validation import percent
+from smp_motor_ident.infer.validation import compute_fit_percent
 from smp_motor_ident.infer.validation import simulate as simulate_freely
-from smp_motor_ident.quality.excitation import excitation
-from smp_motor_ident.quality.resolution import REST
+from smp_motor_ident.quality.excitation import find_excitation
+from smp_motor_ident.quality.resolution import MIN_REST_SAMPLES
 from smp_motor_ident.record import Hardware, Record
 
 TRUTH = {"dc_gain": 15.0, "time_constant": 0.12, "static_voltage": 2.0}
@@ -50,7 +50,7 @@ def test_a_single_level_of_voltage_gives_one_combination(rest):
     assert steady.std < 1.0
     assert [f.evidence["voltage"] for f in found.findings if f.code == "one_level"] == [8.0]
     measured, simulated = simulate_freely(found, record)
-    assert percent(measured, simulated) > 90
+    assert compute_fit_percent(measured, simulated) > 90
 
 
 def test_friction_that_delays_the_first_motion_is_in_the_lags_of_one_step():
@@ -131,7 +131,7 @@ def test_the_scatter_of_an_angle_at_rest_is_not_motion():
     position = moved + scatter * rng.standard_normal(moved.size)
     time, volts = np.arange(moved.size) / 200.0, np.r_[np.zeros(n), driven.voltage]
     rested = replace(driven, time=time, voltage=volts, velocity=None, count=None, position=position)
-    assert np.diff(excitation(rested))[0] < 1.1 * len(driven)
+    assert np.diff(find_excitation(rested))[0] < 1.1 * len(driven)
     found = estimate(rested).combinations["dc_gain"]
     truth = estimate(driven).combinations["dc_gain"]
     assert abs(found.value - truth.value) < 3 * found.std
@@ -298,11 +298,11 @@ def test_a_segment_that_begins_at_rest_keeps_its_first_sample():
 
 
 def test_slow_motion_is_unchanged():
-    slow = [k // (REST - 1) for k in range(90)]
+    slow = [k // (MIN_REST_SAMPLES - 1) for k in range(90)]
     assert kept(counted(slow)) == list(range(90))
 
 
-@pytest.mark.parametrize("rest", [REST, 10 * REST])
+@pytest.mark.parametrize("rest", [MIN_REST_SAMPLES, 10 * MIN_REST_SAMPLES])
 def test_how_long_it_stands_adds_nothing(rest):
     assert len(kept(counted([0, 1, 2, *[3] * rest, 4, 5]))) == 6
 

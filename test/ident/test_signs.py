@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from smp_motor_ident.errors import InsufficientExcitationError, SignalError
-from smp_motor_ident.quality.screen import _signs
-from smp_motor_ident.quality.signs import likeness
+from smp_motor_ident.quality.screen import _check_signs
+from smp_motor_ident.quality.signs import correlate_with_voltage
 
 GOOD = motors.record("rear_left", seconds=4.0)
 N = len(GOOD)
@@ -43,17 +43,17 @@ SLOW = {"steps": steps, "a slow sine": lambda: sine(150.0), "a sine of 25": lamb
 def test_swapped_leads_are_found_and_right_ones_left_alone(name):
     for delay in (0, 1, 2):
         record = late(SLOW[name](), delay)
-        _signs([record], "record")
+        _check_signs([record], "record")
         with pytest.raises(SignalError, match="swapped sign, speed"):
-            _signs([swapped(record)], "record")
+            _check_signs([swapped(record)], "record")
 
 
 def test_a_current_of_the_wrong_sign_is_found_and_the_right_one_left_alone():
     for name, make in SLOW.items():
         record = make()
-        _signs([record], name)
+        _check_signs([record], name)
         with pytest.raises(SignalError, match="swapped sign, current"):
-            _signs([replace(record, current=-record.current)], name)
+            _check_signs([replace(record, current=-record.current)], name)
 
 
 def test_a_current_between_rows_that_were_left_out_shows_no_sign():
@@ -63,8 +63,8 @@ def test_a_current_between_rows_that_were_left_out_shows_no_sign():
     kept = np.arange(0, 2990, 5)
     there = {n: getattr(whole, n)[kept] for n in ("time", "voltage", "count")}
     thin = replace(whole, velocity=None, current=whole.current[kept + 8], **there)
-    assert likeness([thin], [thin.current], lags=False).wrong > 0.4
-    _signs([thin], "record")
+    assert correlate_with_voltage([thin], [thin.current], lags=False).wrong > 0.4
+    _check_signs([thin], "record")
 
 
 @pytest.mark.parametrize("sign", [1, -1])
@@ -72,11 +72,11 @@ def test_a_current_between_rows_that_were_left_out_shows_no_sign():
 def test_three_samples_per_period_do_not_determine_the_sign(samples, sign):
     """Lag, sampling and a driver's clock may come to any phase there: no wrong cause is named."""
     record = sine(samples) if sign > 0 else swapped(sine(samples))
-    found = likeness([record], [record.velocity], lags=True)
+    found = correlate_with_voltage([record], [record.velocity], lags=True)
     # Half a sample is 60 degrees: the nearest delay misses the phase by 30 at most.
     assert min(found.right, found.wrong) > 0.8 * max(found.right, found.wrong)
     with pytest.raises(InsufficientExcitationError, match=r"too fast, .* samples: a speed"):
-        _signs([record], "record")
+        _check_signs([record], "record")
 
 
 def test_a_motor_at_rest_has_no_swapped_sign():
@@ -87,9 +87,9 @@ def test_a_motor_at_rest_has_no_swapped_sign():
         slow = 5.0 * (slow - slow.mean()) / np.abs(slow - slow.mean()).max()
         noise = rng.standard_normal(N)
         noise = replace(GOOD, voltage=slow, count=None, current=None, velocity=noise)
-        _signs([noise], "record")
+        _check_signs([noise], "record")
     with pytest.raises(SignalError, match="swapped sign"):
-        _signs([swapped(GOOD)], "record")
+        _check_signs([swapped(GOOD)], "record")
 
 
 def test_a_reversed_motor_among_gaps_and_of_a_noisy_sensor_is_found():
@@ -97,4 +97,4 @@ def test_a_reversed_motor_among_gaps_and_of_a_noisy_sensor_is_found():
     speed = -GOOD.velocity + 200.0 * rng.standard_normal(N)
     speed[rng.random(N) < 0.2] = np.nan
     with pytest.raises(SignalError, match="swapped sign, speed"):
-        _signs([replace(GOOD, count=None, velocity=speed)], "record")
+        _check_signs([replace(GOOD, count=None, velocity=speed)], "record")

@@ -9,7 +9,7 @@ import pytest
 
 from smp_motor_ident.errors import SignalError
 from smp_motor_ident.estimate import estimate
-from smp_motor_ident.quality.silence import silent
+from smp_motor_ident.quality.silence import refuse_silent_sensor
 
 RATE = 2000.0
 TIME = np.arange(int(10 * RATE)) / RATE
@@ -39,7 +39,7 @@ def test_a_chirp_that_outruns_the_motor_leaves_its_encoder_alive(signal):
     alive = coarse(signal)
     values = getattr(alive, signal)
     assert np.ptp(values[int(0.85 * len(values)) :]) == 0.0  # a silence in which the motor swings
-    silent(alive, "record")
+    refuse_silent_sensor(alive, "record")
 
 
 @pytest.mark.parametrize("signal", ["count", "position", "velocity"])
@@ -50,10 +50,10 @@ def test_an_encoder_whose_cable_comes_off_is_dead(signal, kind):
     else:
         volts = motors.independent.excitation(np.arange(2000) / 200.0, kind, 10.0)
         whole, shares = coarse(signal, volts, 200.0), [0.2, 0.5, 0.85]
-        silent(whole, "record")
+        refuse_silent_sensor(whole, "record")
     for share in shares:
         with pytest.raises(SignalError, match=f"dead encoder, the {signal} stays"):
-            silent(cut(whole, signal, share), "record")
+            refuse_silent_sensor(cut(whole, signal, share), "record")
 
 
 @pytest.mark.parametrize("signal", ["count", "velocity"])
@@ -64,7 +64,7 @@ def test_a_speed_below_the_step_of_its_sensor_is_not_a_dead_sensor(signal):
     if signal == "velocity":
         slow = np.convolve(speed, np.ones(20) / 20, "same")
         record = replace(record, velocity=60.0 * np.round(slow / 60.0))
-    silent(record, "record")
+    refuse_silent_sensor(record, "record")
 
 
 @pytest.mark.parametrize("wheel", ["front_left", "front_right", "rear_left", "rear_right"])
@@ -72,7 +72,7 @@ def test_a_motor_stopped_by_friction_in_a_fast_chirp_is_not_a_dead_encoder(wheel
     volts = 10.0 * np.sin(2 * np.pi * (0.3 * TIME + 5.0 * TIME**2))
     stops = motors.record(wheel, current=False, voltage=volts, rate=RATE, static_voltage=2.0)
     assert np.ptp(stops.count[int(0.8 * len(stops)) :]) == 0
-    silent(replace(stops, velocity=None), "record")
+    refuse_silent_sensor(replace(stops, velocity=None), "record")
 
 
 def test_a_standstill_at_the_end_of_a_run_does_not_affect_the_next():
@@ -81,8 +81,10 @@ def test_a_standstill_at_the_end_of_a_run_does_not_affect_the_next():
     stands = (np.arange(2000) >= 850) & (np.arange(2000) < 1150)
     kept = np.where(stands, whole.count[850], whole.count).astype(np.int64)
     with pytest.raises(SignalError, match="dead encoder"):
-        silent(replace(whole, count=kept), "record")
-    silent(replace(whole, count=kept, starts=(0, 1000)), "two runs")  # 150 rows each: too few
+        refuse_silent_sensor(replace(whole, count=kept), "record")
+    refuse_silent_sensor(
+        replace(whole, count=kept, starts=(0, 1000)), "two runs"
+    )  # 150 rows each: too few
 
 
 @pytest.mark.parametrize("span", [(800, 1200), (500, 1400)])

@@ -9,7 +9,7 @@ import pytest
 
 from smp_motor_ident.estimate import estimate
 from smp_motor_ident.fit.data import speed_quantum
-from smp_motor_ident.quality.lag import lagged
+from smp_motor_ident.quality.lag import apply_lag
 from smp_motor_ident.record import Record
 
 
@@ -52,7 +52,7 @@ def test_steps_of_one_size_say_that_a_ramp_of_the_driver_would_not_show():
     for sizes, said in (((2.0,), True), ((1.0, 2.0, 4.0), False)):
         steps = rng.choice(sizes, 24) * np.r_[np.ones(12), -np.ones(12)]
         command = np.repeat(np.r_[0.0, np.cumsum(steps)], 100)
-        speed = lagged(8.0 * command, tau / 0.005) + 0.3 * rng.standard_normal(command.size)
+        speed = apply_lag(8.0 * command, tau / 0.005) + 0.3 * rng.standard_normal(command.size)
         t = 0.005 * np.arange(command.size)
         codes = [f.code for f in estimate(Record("motor", t, command, velocity=speed)).findings]
         assert ("one_size_of_step" in codes) is said and "one_size_of_voltage" not in codes

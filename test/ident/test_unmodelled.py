@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from smp_motor_ident.estimate import estimate
-from smp_motor_ident.infer.unmodelled import relative_error
+from smp_motor_ident.infer.unmodelled import compute_relative_error
 from smp_motor_ident.record import Record
 from smp_motor_ident.report.document import identification_document, read_identification
 
@@ -26,7 +26,7 @@ def test_circle_holds_the_error_as_often_as_it_says():
     for seed in range(200):
         rng = np.random.default_rng(seed)
         true = 0.7 * np.exp(2j * np.pi * rng.random())
-        found = relative_error(*lines(rng, error=true))
+        found = compute_relative_error(*lines(rng, error=true))
         radius = np.array(found.bound) - np.array(found.shown)
         inside += list(np.abs(np.array(found.shown) - 0.7) <= radius)
     assert np.mean(inside) > 0.95
@@ -39,7 +39,7 @@ def test_circle_of_windowed_noise_holds_nothing_as_often_as_it_says():
     for seed in range(200):
         rng = np.random.default_rng(seed)
         noise, output = (np.fft.rfft(window * rng.standard_normal(2000))[2:] for _ in range(2))
-        found = relative_error(np.arange(2.0, 1001.0), noise, output)
+        found = compute_relative_error(np.arange(2.0, 1001.0), noise, output)
         inside += sum(2 * s <= b for s, b in zip(found.shown, found.bound, strict=True))
         bands += len(found.shown)
     assert 0.93 < inside / bands < 0.985
@@ -48,7 +48,7 @@ def test_circle_of_windowed_noise_holds_nothing_as_often_as_it_says():
 def test_bound_grows_where_the_output_is_small():
     rng = np.random.default_rng(1)
     omega, error, output = lines(rng, noise=0.01)
-    found = relative_error(omega, error, output / (1 + (omega / 10) ** 2))
+    found = compute_relative_error(omega, error, output / (1 + (omega / 10) ** 2))
     bound = np.array(found.bound)
     # A response that falls to 1/50 or less in the last band, with 25 times the lines.
     assert bound[0] < 0.02
@@ -62,7 +62,7 @@ def test_resonance_narrower_than_its_band_is_shown_by_its_peak():
         rng = np.random.default_rng(seed)
         omega, error, output = lines(rng, n=1200, noise=1.5)
         error += 3.0 * 5j * omega / (50.0**2 - omega**2 + 5j * omega) * output
-        shown = relative_error(omega, error, output)
+        shown = compute_relative_error(omega, error, output)
         k = int(np.argmin(np.abs(np.log(np.array(shown.frequency) / 50.0))))
         # Three, less the loss at half of the distance to the next tested resonance.
         assert shown.bound[k] > 2.4
@@ -76,11 +76,13 @@ def test_of_several_outputs_the_one_that_is_moved_least_tells():
     rng = np.random.default_rng(3)
     omega, error, output = lines(rng, noise=0.1)
     faint = output / (1 + (omega / 10) ** 2)
-    alone, both = (relative_error(omega, error, x) for x in (faint, np.array([output, faint])))
+    alone, both = (
+        compute_relative_error(omega, error, x) for x in (faint, np.array([output, faint]))
+    )
     assert both == alone
     # An error beyond the response itself counts, whatever moved the motor.
     _, _, other = lines(rng)
-    both = relative_error(omega, error + 3.0 * output, np.array([output, 1e-2 * other]))
+    both = compute_relative_error(omega, error + 3.0 * output, np.array([output, 1e-2 * other]))
     assert both.shown == pytest.approx([3.0] * len(both.shown), rel=0.05)
 
 

@@ -8,7 +8,7 @@ from recordings import START, floats, in_order, read
 
 from smp_motor_ident.bag import read_records
 from smp_motor_ident.estimate import estimate
-from smp_motor_ident.quality.stamps import find_beat, on_beat
+from smp_motor_ident.quality.stamps import find_beat, move_to_beat
 from smp_motor_ident.record import Hardware, Record
 
 T = 10_000_000  # ns
@@ -115,7 +115,7 @@ def test_a_record_with_stamps_of_its_own_keeps_them():
     rng = np.random.default_rng(9)
     time = np.sort(1e-2 * np.arange(2000) + rng.uniform(0, 0.8e-2, 2000))
     record = Record("m", time, np.sin(time), velocity=np.sin(2 * np.pi * time))
-    assert on_beat(record) is record
+    assert move_to_beat(record) is record
 
 
 @pytest.mark.parametrize("rounding", [np.floor, np.rint])
@@ -130,9 +130,9 @@ def test_a_regular_time_that_was_only_rounded_is_put_back_whatever_the_motion_sh
         stamp = multiple * rounding(time / multiple)
         return Record("m", stamp - stamp[0], np.sin(at), velocity=speed)
 
-    np.testing.assert_allclose(np.diff(on_beat(stamped(at)).time), period, rtol=1e-3)
+    np.testing.assert_allclose(np.diff(move_to_beat(stamped(at)).time), period, rtol=1e-3)
     late = stamped(sampled_late)
-    assert on_beat(late) is late
+    assert move_to_beat(late) is late
 
 
 def _stalled(seed: int, sampled_late: bool) -> Record:
@@ -151,8 +151,8 @@ def _stalled(seed: int, sampled_late: bool) -> Record:
 @pytest.mark.parametrize("seed", range(8))
 def test_samples_that_a_stall_made_late_keep_their_stamps_and_late_stamps_do_not(seed):
     honest, arrived = _stalled(seed, True), _stalled(seed, False)
-    assert on_beat(honest) is honest
-    assert "arrival_beat" in [finding.code for finding in on_beat(arrived).findings]
+    assert move_to_beat(honest) is honest
+    assert "arrival_beat" in [finding.code for finding in move_to_beat(arrived).findings]
 
 
 def test_how_sure_the_beat_is_of_its_period_is_how_it_scatters():
