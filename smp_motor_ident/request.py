@@ -13,7 +13,7 @@ from smp_motor_ident.chain.catalogue import GIVEN
 from smp_motor_ident.chain.chain import Constraint
 from smp_motor_ident.errors import ParameterError
 from smp_motor_ident.fit.search import SelectionPolicy
-from smp_motor_ident.limits import CURRENT_THERE
+from smp_motor_ident.limits import MIN_CURRENT_SHARE
 from smp_motor_ident.record import Record
 
 MODELS = ("first_order", "second_order", "electromechanical")
@@ -154,5 +154,5 @@ def has_current(group: Sequence[Record]) -> bool:
     """Tell whether a current was measured in enough samples."""
     there = [r.current for r in group if r.current is not None]
     finite = sum(int(np.isfinite(c).sum()) for c in there)
-    enough = finite > CURRENT_THERE * sum(len(r) for r in group)
+    enough = finite > MIN_CURRENT_SHARE * sum(len(r) for r in group)
     return enough and any(np.nanstd(c) > 0 for c in there)

@@ -10,9 +10,9 @@ from numpy.fft import irfft, rfft
 from smp_motor_control.arrays import Array, Integers
 from smp_motor_ident.limits import (
     EXPLANATION_LEVEL,
-    HALF_EXPLAINED,
     MAX_LATE_COMMAND_RESIDUAL,
     MAX_SHIFTED_RESIDUAL_RATIO,
+    MIN_EXPLAINED_SHARE,
 )
 from smp_motor_ident.quality.lag import apply_lag
 
@@ -78,7 +78,7 @@ def find_following_share(u: Array, y: Array) -> tuple[float, bool]:
     if np.count_nonzero(np.diff(u)) < LAGS or _is_clock(u) or _is_clock(y):
         return 0.0, False
     steps = np.diff(y, prepend=y[:1])
-    itself = find_lagged_share(u, y) if _explained_share(u, steps) < HALF_EXPLAINED else 0.0
+    itself = find_lagged_share(u, y) if _explained_share(u, steps) < MIN_EXPLAINED_SHARE else 0.0
     return max((itself, False), (find_lagged_share(u, steps), True))
 
 
@@ -153,7 +153,7 @@ def find_lagged_share(u: Array, y: Array) -> float:
     """Return the share of a signal explained by a lag of another; 0 if another shift is better."""
     lags = np.geomspace(1.0, max(y.size / 20, 2.0), 8)
     share = max(_explained_share(apply_lag(u - u[0], float(lag)), y) for lag in lags)
-    return share if share > max(HALF_EXPLAINED, _explained_share(u, y)) else 0.0
+    return share if share > max(MIN_EXPLAINED_SHARE, _explained_share(u, y)) else 0.0
 
 
 def find_clock(values: list[Array]) -> int | None:

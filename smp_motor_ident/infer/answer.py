@@ -22,7 +22,7 @@ from smp_motor_ident.fit.data import Data
 from smp_motor_ident.fit.descend import Fit
 from smp_motor_ident.infer.levels import Levels
 from smp_motor_ident.infer.uncertainty import DRIVER_SLOTS, Contribution
-from smp_motor_ident.limits import CURRENT_ACCURACY, LOOSE_QUANTITY, ONE_SIZE_ACCURACY
+from smp_motor_ident.limits import CURRENT_ACCURACY, MAX_RELATIVE_STD, ONE_SIZE_ACCURACY
 from smp_motor_ident.record import Hardware
 from smp_motor_ident.result import NORMAL_95, UNITS, Quantity, Share, Systematic
 
@@ -108,7 +108,7 @@ def _make_quantity(
     low = max(low, 0.0) if positive else low
     made = Quantity(value, std, (low, high), UNITS[name], "estimated", shares, valid)
     of_priors = math.hypot(std, *(s.size for s in shares if s.cause in CAUSE_OF_PRIOR.values()))
-    loose = name in WITHHELD_IF_LOOSE and of_priors > LOOSE_QUANTITY * abs(value)
+    loose = name in WITHHELD_IF_LOOSE and of_priors > MAX_RELATIVE_STD * abs(value)
     if loose or not math.isfinite(std):
         ends = made.total_ci95 or (low, high)
         return Quantity(None, None, (max(ends[0], 0.0), ends[1]), UNITS[name], "unidentifiable")

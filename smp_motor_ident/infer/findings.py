@@ -23,7 +23,7 @@ from smp_motor_ident.infer.answer import SCALE_POWERS, Answer
 from smp_motor_ident.infer.levels import Levels
 from smp_motor_ident.infer.uncertainty import Contribution
 from smp_motor_ident.infer.validation import compute_explained_percent, estimate_white_share
-from smp_motor_ident.limits import FRICTION_MOST
+from smp_motor_ident.limits import MAX_STATIC_VOLTAGE_SHARE
 from smp_motor_ident.quality.screen import name_records
 from smp_motor_ident.quality.units import check_plausibility
 from smp_motor_ident.record import Record
@@ -81,7 +81,7 @@ class EstimateContext:
         """Whether the residual is no more than the resolution of the sensor."""
         own = self.data.quantum / math.sqrt(12)
         left = self.data.motion - self.found.motion
-        return own > 0 and float(np.nanstd(left)) < math.sqrt(limits.UNEXPLAINED) * own
+        return own > 0 and float(np.nanstd(left)) < math.sqrt(limits.MAX_RESOLUTION_VARIANCE) * own
 
 
 def refuse_unexplained(context: EstimateContext) -> None:
@@ -91,7 +91,7 @@ def refuse_unexplained(context: EstimateContext) -> None:
         compute_explained_percent(context.data, context.found.motion),
     )
     where = name_records(context.group)
-    enough = fitted >= limits.WORST_FIT or context.within_resolution
+    enough = fitted >= limits.MIN_FIT or context.within_resolution
     if not enough and not _is_nearly_constant(context):
         if estimate_white_share(context.data) > MIN_REST_NOISE_SHARE:
             raise InsufficientExcitationError(
@@ -106,7 +106,7 @@ def refuse_unexplained(context: EstimateContext) -> None:
     offset = abs(context.found.chain.values.get("current_offset", 0.0))
     if offset and context.data.current is not None:
         largest = float(np.nanmax(np.abs(context.data.current)))
-        if offset > limits.LARGEST_OFFSET * max(largest - offset, 1e-12):
+        if offset > limits.MAX_CURRENT_OFFSET * max(largest - offset, 1e-12):
             raise CurrentError(
                 f"{where}: current has an offset of {offset:.3g} A where it reaches "
                 f"{largest:.3g} A; zero the current sensor at rest and record again"
@@ -127,7 +127,7 @@ def _refuse_angle(where: str, group: Sequence[Record]) -> None:
     data = prepare(angles, use_current=False)
     for chain in guess_motors(data, 1):
         found = fit(data, approach(data, chain, data.scales(1.0), data.initial), rounds=1)
-        if compute_explained_percent(data, found.motion) > limits.FIT_EXPLAINS:
+        if compute_explained_percent(data, found.motion) > limits.MIN_RELIABLE_FIT:
             raise SignalError(
                 f"{where}: the speed follows the voltage as an angle does; map it as position"
             )
@@ -161,17 +161,17 @@ def collect_findings(context: EstimateContext) -> list[Finding]:
 def _check_fit(context: EstimateContext) -> Iterator[Finding]:
     estimation, validation = context.percent.estimation or 0.0, context.percent.validation
     estimation = max(estimation, compute_explained_percent(context.data, context.found.motion))
-    if estimation < limits.FIT_EXPLAINS and not context.within_resolution:
+    if estimation < limits.MIN_RELIABLE_FIT and not context.within_resolution:
         yield Finding(
             "poor_fit", "unreliable",
             f"the model explains {estimation:.0f} % of the speed; at least "
-            f"{limits.FIT_EXPLAINS:.0f} % are expected",
-            {"fit_percent": estimation, "limit": limits.FIT_EXPLAINS},
+            f"{limits.MIN_RELIABLE_FIT:.0f} % are expected",
+            {"fit_percent": estimation, "limit": limits.MIN_RELIABLE_FIT},
             "look for a second cause of the motion, such as a load, and record the driver's output "
             "voltage",
         )  # fmt: skip
     fitted = context.percent.estimation or 0.0
-    falls = validation is not None and validation < fitted - limits.FIT_HOLDS
+    falls = validation is not None and validation < fitted - limits.MAX_VALIDATION_LOSS
     if falls and not context.within_resolution:
         yield Finding(
             "validation", "unreliable",
@@ -222,7 +222,7 @@ def _check_time_constant(context: EstimateContext) -> Iterator[Finding]:
 
 def _check_friction(context: EstimateContext) -> Iterator[Finding]:
     static, most = context.quantity("static_voltage"), context.largest_command
-    if static is None or (static.value or 0.0) <= FRICTION_MOST * most:
+    if static is None or (static.value or 0.0) <= MAX_STATIC_VOLTAGE_SHARE * most:
         return
     yield Finding(
         "friction_dominates", "unreliable",
@@ -391,7 +391,7 @@ def _report_current_scale(context: EstimateContext) -> Iterator[Finding]:
         )  # fmt: skip
         return
     scale = ohmmeter / found.value
-    far = limits.RESISTANCE_BAND + limits.HALF_WIDTH * (found.std or 0.0) / found.value
+    far = limits.RESISTANCE_BAND + limits.CI95_HALF_WIDTH * (found.std or 0.0) / found.value
     off = abs(scale - 1) > far
     yield Finding(
         "current_scale", "unreliable" if off else "note",

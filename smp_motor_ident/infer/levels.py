@@ -10,7 +10,7 @@ import numpy as np
 from smp_motor_control.arrays import Array
 from smp_motor_ident.fit.data import Data
 from smp_motor_ident.fit.start import average_command
-from smp_motor_ident.limits import REST, SAME_LEVEL
+from smp_motor_ident.limits import LEVEL_TOLERANCE, MAX_REST_VOLTAGE
 
 MIN_SWINGS = 6
 MAX_STEP_SHARE = 0.2  # of the rows, in which a command of steps changes
@@ -49,7 +49,9 @@ def _has_coasting(data: Data) -> bool:
 def _find_only_size(command: Array) -> float:
     """Return the only size of a command besides zero; a row between two levels is no third."""
     top = float(np.abs(command).max())
-    other = (top - np.abs(command) > SAME_LEVEL * top) & (np.abs(command) > REST * top)
+    other = (top - np.abs(command) > LEVEL_TOLERANCE * top) & (
+        np.abs(command) > MAX_REST_VOLTAGE * top
+    )
     change = np.diff(command)
     between = (change[:-1] * change[1:] > 0) & ~other[:-2] & ~other[2:]
     other[1:-1] &= ~between
@@ -65,17 +67,17 @@ def _find_only_swing(data: Data) -> float:
     peaks = np.maximum.reduceat(np.abs(command), turns)[:-1]
     lengths = np.diff(begin[turns])
     peak, length = float(np.median(peaks)), float(np.median(lengths))
-    alike = (np.abs(peaks - peak) < SAME_LEVEL * peak) & (
-        np.abs(lengths - length) < SAME_LEVEL * length + 1.5 * data.rows.step
+    alike = (np.abs(peaks - peak) < LEVEL_TOLERANCE * peak) & (
+        np.abs(lengths - length) < LEVEL_TOLERANCE * length + 1.5 * data.rows.step
     )
-    return peak if float(alike.mean()) > 1 - SAME_LEVEL else 0.0
+    return peak if float(alike.mean()) > 1 - LEVEL_TOLERANCE else 0.0
 
 
 def _find_only_step(command: Array) -> float:
     change = np.abs(np.diff(command))
-    steps = change[change > REST * float(np.abs(command).max())]
+    steps = change[change > MAX_REST_VOLTAGE * float(np.abs(command).max())]
     if not MIN_SWINGS <= steps.size < MAX_STEP_SHARE * change.size:
         return 0.0
     size = float(np.median(steps))
-    alike = np.abs(steps - size) < SAME_LEVEL * size
-    return size if float(alike.mean()) > 1 - SAME_LEVEL else 0.0
+    alike = np.abs(steps - size) < LEVEL_TOLERANCE * size
+    return size if float(alike.mean()) > 1 - LEVEL_TOLERANCE else 0.0

@@ -246,7 +246,7 @@ class Monitor:
     def _judge(self) -> None:
         """Store since when, in time of motion, each value is significantly out of its band."""
         for name, (share, std, band) in self._shares().items():
-            if abs(share) - band > limits.HALF_WIDTH * std:
+            if abs(share) - band > limits.CI95_HALF_WIDTH * std:
                 self._outside.setdefault(name, self._clock)
             elif abs(share) < band:
                 self._outside.pop(name, None)
@@ -258,7 +258,7 @@ class Monitor:
         out = {
             name: shares[name][0]
             for name, since in self._outside.items()
-            if self._clock - since >= limits.LEFT_BAND and known[name][0] == "estimated"
+            if self._clock - since >= limits.MIN_OUT_OF_BAND_S and known[name][0] == "estimated"
         }
         return [_finding(name, share, out) for name, share in out.items()]
 

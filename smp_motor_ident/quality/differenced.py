@@ -25,12 +25,12 @@ from smp_motor_control.arrays import Array
 from smp_motor_ident.finding import Finding
 from smp_motor_ident.limits import (
     BEAT_JITTER,
-    COUNTS_A_SAMPLE,
-    FEWEST,
-    NEIGHBOURS,
-    NOMINAL_PERIOD,
-    ONE_COUNT,
-    SIGN_SURE,
+    MAX_COUNTS_PER_SAMPLE,
+    MAX_NEIGHBOUR_CORRELATION,
+    MAX_ONE_COUNT_VARIANCE,
+    MIN_INTERVAL_SLOPE,
+    MIN_SAMPLES,
+    MIN_SIGN_STDS,
 )
 from smp_motor_ident.quality.resolution import speed_quantum
 from smp_motor_ident.record import Record
@@ -93,7 +93,7 @@ def _is_smooth_within_one_count(moved: Array) -> bool:
 
     With more than a few counts per sample the speed itself can be used.
     """
-    if moved.size < CUBIC_SAMPLES or np.abs(moved).max() > COUNTS_A_SAMPLE:
+    if moved.size < CUBIC_SAMPLES or np.abs(moved).max() > MAX_COUNTS_PER_SAMPLE:
         return False
     count = np.cumsum(moved)
     from scipy.signal import savgol_coeffs, savgol_filter  # takes a while to load
@@ -101,7 +101,9 @@ def _is_smooth_within_one_count(moved: Array) -> bool:
     rest = count - savgol_filter(count, CUBIC_SAMPLES, 3)
     turns = np.convolve(moved != 0, np.ones(CUBIC_SAMPLES), "same") > 1
     left = 1 - float(savgol_coeffs(CUBIC_SAMPLES, 3)[CUBIC_SAMPLES // 2])  # of a white error
-    return bool(turns.any() and np.mean(np.square(rest[turns])) < ONE_COUNT * left / 12)
+    return bool(
+        turns.any() and np.mean(np.square(rest[turns])) < MAX_ONE_COUNT_VARIANCE * left / 12
+    )
 
 
 def _has_alternating_errors(moved: Array) -> bool:
@@ -109,7 +111,7 @@ def _has_alternating_errors(moved: Array) -> bool:
     smooth = np.convolve(moved, np.full(SMOOTHING_SAMPLES, 1 / SMOOTHING_SAMPLES), "same")
     rest = (moved - smooth)[SMOOTHING_SAMPLES:-SMOOTHING_SAMPLES]
     size = float(rest @ rest)
-    return size > 0.0 and float(rest[1:] @ rest[:-1]) < NEIGHBOURS * size
+    return size > 0.0 and float(rest[1:] @ rest[:-1]) < MAX_NEIGHBOUR_CORRELATION * size
 
 
 def correct_nominal_period(record: Record) -> Record:
@@ -157,7 +159,7 @@ def _follows_intervals(velocity: Array, interval: Array) -> bool:
     """
     known = np.isfinite(velocity) & np.isfinite(interval)
     speed, took = velocity[known], interval[known]
-    if speed.size < FEWEST or np.std(took) < BEAT_JITTER * np.median(took):
+    if speed.size < MIN_SAMPLES or np.std(took) < BEAT_JITTER * np.median(took):
         return False
     took = np.minimum(took, MIN_GAP_RATIO * np.median(took))  # the motion in a gap is unknown
     window = np.full(SMOOTHING_SAMPLES, 1 / SMOOTHING_SAMPLES)
@@ -169,4 +171,4 @@ def _follows_intervals(velocity: Array, interval: Array) -> bool:
         return False
     slope = float(x @ y) / power
     std = float(np.linalg.norm((y - slope * x) * x)) / power
-    return slope - SIGN_SURE * std > NOMINAL_PERIOD
+    return slope - MIN_SIGN_STDS * std > MIN_INTERVAL_SLOPE

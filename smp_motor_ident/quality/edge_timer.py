@@ -15,7 +15,12 @@ import numpy as np
 
 from smp_motor_control.arrays import Array, Flags, Integers
 from smp_motor_ident.finding import Finding
-from smp_motor_ident.limits import EDGE_SPEED, EDGES, HALF_EXPLAINED, HELD
+from smp_motor_ident.limits import (
+    MIN_EDGE_READINGS,
+    MIN_EDGE_SPEED,
+    MIN_EXPLAINED_SHARE,
+    MIN_HELD_SHARE,
+)
 from smp_motor_ident.quality.resolution import speed_quantum
 from smp_motor_ident.record import Record
 
@@ -61,7 +66,7 @@ def _find_count_angle(record: Record, velocity: Array) -> float:
     known = np.flatnonzero(np.isfinite(velocity))
     speed, when = velocity[known], record.time[known]
     at = np.flatnonzero(np.diff(speed) != 0) + 1
-    if at.size < EDGES:
+    if at.size < MIN_EDGE_READINGS:
         return 0.0
     held, after = np.diff(when[at]), np.abs(speed[at[1:]])
     held, after = held[after > 0], after[after > 0]
@@ -70,14 +75,14 @@ def _find_count_angle(record: Record, velocity: Array) -> float:
         return 2 * np.pi / per_turn
     step = record.sample_time
     tells = held > MIN_HOLDING_ROWS * step
-    best, max_alike = 0.0, EDGES - 1
-    least = EDGE_SPEED * MIN_HOLDING_ROWS * step * float(np.abs(speed).max())
+    best, max_alike = 0.0, MIN_EDGE_READINGS - 1
+    least = MIN_EDGE_SPEED * MIN_HOLDING_ROWS * step * float(np.abs(speed).max())
     for count in np.percentile((held * after)[tells], COUNT_PERCENTILES) if tells.any() else ():
         slow = count / after > MIN_HOLDING_ROWS * step
         alike = np.abs(held - count / after)[slow] < HOLDING_TOLERANCE_ROWS * step
-        if count < least or np.unique(after[slow]).size < HALF_EXPLAINED * alike.size:
+        if count < least or np.unique(after[slow]).size < MIN_EXPLAINED_SHARE * alike.size:
             continue  # levels of a rounded speed
-        if alike.sum() > max_alike and alike.mean() > HELD:
+        if alike.sum() > max_alike and alike.mean() > MIN_HELD_SHARE:
             best, max_alike = float(count), int(alike.sum())
     return best
 
@@ -85,7 +90,7 @@ def _find_count_angle(record: Record, velocity: Array) -> float:
 def _are_timer_ticks(period: Array) -> bool:
     """Tell whether times of a count are whole microseconds, as of usual timers."""
     rest = period / TIMER_TICK_S - np.rint(period / TIMER_TICK_S)
-    return bool(np.mean(np.abs(rest) < TICK_TOLERANCE) > HELD)
+    return bool(np.mean(np.abs(rest) < TICK_TOLERANCE) > MIN_HELD_SHARE)
 
 
 def _interpolate_speed(record: Record, velocity: Array, count: float) -> tuple[Array, float]:

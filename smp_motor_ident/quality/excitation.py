@@ -8,7 +8,7 @@ import numpy as np
 
 from smp_motor_control.arrays import Array
 from smp_motor_ident.finding import Finding
-from smp_motor_ident.limits import EXCERPT, FEWEST, REST
+from smp_motor_ident.limits import MAX_EXCERPT_ROWS, MAX_REST_VOLTAGE, MIN_SAMPLES
 from smp_motor_ident.record import Record
 
 STRETCH_COUNT = 8
@@ -28,7 +28,7 @@ def _estimate_white_std(values: Array) -> float:
 
 def find_excitation(record: Record) -> tuple[int, int]:
     """Return first and end of the excited rows of a record, for `Record.slice`."""
-    moves = np.abs(record.voltage) > REST * np.abs(record.voltage).max()
+    moves = np.abs(record.voltage) > MAX_REST_VOLTAGE * np.abs(record.voltage).max()
     for name in ("velocity", "position", "count"):
         values = getattr(record, name)
         if values is None:
@@ -36,7 +36,7 @@ def find_excitation(record: Record) -> tuple[int, int]:
         y = np.where(np.isfinite(values), values, 0.0)
         y = y if name == "velocity" else np.diff(y, prepend=y[0])
         noise = 0.0 if name == "count" else _estimate_white_std(y)
-        moves |= np.abs(y) > max(REST * float(np.abs(y).max()), MAX_NOISE_STDS * noise)
+        moves |= np.abs(y) > max(MAX_REST_VOLTAGE * float(np.abs(y).max()), MAX_NOISE_STDS * noise)
         break
     busy = np.flatnonzero(moves)
     # A rest shorter than the excitation does not hide it, and shows the sensor's noise.
@@ -46,14 +46,16 @@ def find_excitation(record: Record) -> tuple[int, int]:
     return max(0, int(busy[0]) - REST_MARGIN), min(len(record), int(busy[-1]) + REST_MARGIN + 1)
 
 
-def select_excerpts(records: Sequence[Record], max_rows: int = round(EXCERPT)) -> list[Record]:
+def select_excerpts(
+    records: Sequence[Record], max_rows: int = round(MAX_EXCERPT_ROWS)
+) -> list[Record]:
     """Return evenly spread stretches of records that have more than ``max_rows`` rows in all."""
     rows = sum(map(len, records))
     count = -(-STRETCH_COUNT // len(records)) if records else 0
     parts: list[Record] = []
     for record in records:
         length = max_rows * len(record) // (rows * count)
-        if rows <= max_rows or length < FEWEST:
+        if rows <= max_rows or length < MIN_SAMPLES:
             parts.append(record)
         else:
             parts += _cut_stretches(record, count, length)

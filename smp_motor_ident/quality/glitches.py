@@ -13,7 +13,7 @@ import numpy as np
 
 from smp_motor_control.arrays import Array, Flags
 from smp_motor_ident.finding import Finding
-from smp_motor_ident.limits import GLITCH, GLITCHES
+from smp_motor_ident.limits import MAX_GLITCH_SHARE, MIN_GLITCH_RATIO
 from smp_motor_ident.record import Record
 
 MIN_GLITCH_SHARE = 0.05  # of the signal's range, and of the voltage's for a pulse
@@ -32,7 +32,7 @@ def remove_glitches(record: Record) -> Record:
         if values is None:
             continue
         wrong = _find_glitches(values, pulsed)
-        if not wrong.any() or wrong.mean() > GLITCHES:
+        if not wrong.any() or wrong.mean() > MAX_GLITCH_SHARE:
             continue
         first = int(np.argmax(wrong))
         found = Finding(
@@ -65,7 +65,7 @@ def _find_glitches(values: Array, pulsed: Flags) -> Flags:
         low, high = np.percentile(values[at][some], (1, 99))
         moves = np.abs(np.diff(values[at]))[some]
         least = max(
-            GLITCH * float(np.percentile(beyond[some], 75)),
+            MIN_GLITCH_RATIO * float(np.percentile(beyond[some], 75)),
             MIN_CHANGE_RATIO * float(np.median(moves[moves > 0])) if moves.any() else 0.0,
             MIN_GLITCH_SHARE * float(high - low),
         )

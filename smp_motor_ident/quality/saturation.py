@@ -9,7 +9,7 @@ from smp_motor_control.arrays import Array, Flags
 from smp_motor_ident import limits
 from smp_motor_ident.errors import SignalError
 from smp_motor_ident.finding import Finding
-from smp_motor_ident.limits import REGULATED
+from smp_motor_ident.limits import MIN_REGULATED_VARIANCE
 from smp_motor_ident.record import Record
 
 SMOOTHING_SAMPLES = 9  # of a moving mean that keeps the motion of a speed from counts
@@ -41,12 +41,14 @@ def refuse_saturation(record: Record, speed: Array, where: str) -> Iterator[Find
             if share < 0.01 or at.sum() < 5 * next_times or runs.sum() < 0.5 * at.sum():
                 continue
             # The last samples of a rest may be late, of a voltage that has moved since.
-            late = int(limits.LATE_ROWS)
+            late = int(limits.MAX_LATE_ROWS)
             early = at & np.append(at[late:], [False] * late)
-            if early.sum() < limits.AT_LIMIT:
+            if early.sum() < limits.MIN_ROWS_AT_LIMIT:
                 continue
             low, high = np.percentile(v[early], [5, 95])
-            if high - low < 10 * limits.METER * np.ptp(v) and not _jumps_to_limit(x, at):
+            if high - low < 10 * limits.VOLTMETER_SCATTER * np.ptp(v) and not _jumps_to_limit(
+                x, at
+            ):
                 continue
             if name == "current" and _fits_constant_current(
                 record.current == limit, record.voltage, speed
@@ -85,13 +87,15 @@ def _fits_constant_current(rests: Flags, voltage: Array, speed: Array) -> bool:
     v, w = voltage[rests], smooth[rests]
     v, w = v - v.mean(), w - w.mean()
     both = float(v @ w)
-    return both > 0 and both**2 > REGULATED * float((v @ v) * (w @ w))
+    return both > 0 and both**2 > MIN_REGULATED_VARIANCE * float((v @ v) * (w @ w))
 
 
 def _has_one_level(v: Array) -> bool:
     """Tell whether the motor is driven by one level of voltage, at which it may come to rest."""
-    driven = v[np.abs(v) > limits.REST * np.abs(v).max()]
-    return not driven.size or bool(np.ptp(driven) < 10 * limits.METER * np.abs(driven).max())
+    driven = v[np.abs(v) > limits.MAX_REST_VOLTAGE * np.abs(v).max()]
+    return not driven.size or bool(
+        np.ptp(driven) < 10 * limits.VOLTMETER_SCATTER * np.abs(driven).max()
+    )
 
 
 def _jumps_to_limit(x: Array, at: Flags) -> bool:

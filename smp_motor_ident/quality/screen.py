@@ -64,11 +64,11 @@ def name_records(records: Sequence[Record]) -> str:
 
 def _check_length(records: Sequence[Record], where: str) -> None:
     samples = sum(len(r) for r in records)
-    if samples < limits.FEWEST:
+    if samples < limits.MIN_SAMPLES:
         duration = sum(r.duration for r in records)
         raise InsufficientExcitationError(
             f"{where}: too short, {samples} samples in {duration:.3g} s; record at least "
-            f"{limits.FEWEST:.0f} samples (faster, or the same again), better 20 s or more "
+            f"{limits.MIN_SAMPLES:.0f} samples (faster, or the same again), better 20 s or more "
             "with a changing voltage"
         )
 
@@ -81,7 +81,7 @@ def _check_lost_samples(record: Record) -> Iterator[Finding]:
             continue
         lost = float(np.mean(~np.isfinite(values)))
         lost -= read_held_share(record) if name == "velocity" else 0.0  # which has a finding
-        if lost > limits.MOST_LOST and (name == "velocity" or record.velocity is None):
+        if lost > limits.MAX_LOST_SHARE and (name == "velocity" or record.velocity is None):
             raise SignalError(
                 f"{where}: {name} is NaN in {100 * lost:.0f} % of the samples; "
                 "repair the sensor or its connection and record again"
@@ -103,7 +103,7 @@ def _report_left_out(name: str, lost: float) -> Finding:
 def _check_excitation(records: Sequence[Record], where: str) -> None:
     largest = max(float(np.abs(r.voltage).max()) for r in records)
     supply = max(r.hardware.supply_voltage or 0.0 for r in records)
-    if largest <= limits.METER * supply:
+    if largest <= limits.VOLTMETER_SCATTER * supply:
         raise InsufficientExcitationError(
             f"{where}: no excitation, the voltage stays within {largest:.3g} V of 0 V; drive the "
             "motor with a sine, square or Fourier voltage while recording"
@@ -111,13 +111,13 @@ def _check_excitation(records: Sequence[Record], where: str) -> None:
     # A voltmeter's scatter around a level is not an excitation; a step is one.
     levels = [float(np.mean(r.voltage)) for r in records]
     still = [
-        float(np.std(r.voltage)) < limits.METER * abs(level)
-        and float(np.ptp(r.voltage)) < 10 * limits.METER * abs(level)
+        float(np.std(r.voltage)) < limits.VOLTMETER_SCATTER * abs(level)
+        and float(np.ptp(r.voltage)) < 10 * limits.VOLTMETER_SCATTER * abs(level)
         for r, level in zip(records, levels, strict=True)
     ]
     if (
         all(still)
-        and float(np.ptp(levels)) < limits.METER * abs(levels[0])
+        and float(np.ptp(levels)) < limits.VOLTMETER_SCATTER * abs(levels[0])
         and not any(_rises_at_start(r) for r in records)
     ):
         raise InsufficientExcitationError(
@@ -137,7 +137,7 @@ def _rises_at_start(record: Record) -> bool:
     """
     speed = measured_speed(record)
     speed = speed[np.isfinite(speed)]
-    if speed.size < limits.FEWEST:
+    if speed.size < limits.MIN_SAMPLES:
         return False
     length = 1
     while speed.size // length >= MIN_MEANS:
@@ -254,17 +254,24 @@ def _check_signs(records: Sequence[Record], where: str, late: bool = True) -> No
         )
         if found is None:
             continue
-        sure = limits.SIGN_SURE * found.chance
+        sure = limits.MIN_SIGN_STDS * found.chance
         # Samples of a current between switched voltages show little of it because of the lag.
-        least = limits.SIGN_LEAST if what == "speed" else limits.SIGN_ALIKE
-        if found.wrong - found.right > max(least, min(sure, limits.SIGN_ALIKE * found.wrong)):
+        least = limits.MIN_SIGN_CORRELATION if what == "speed" else limits.MIN_TURNING_CORRELATION
+        if found.wrong - found.right > max(
+            least, min(sure, limits.MIN_TURNING_CORRELATION * found.wrong)
+        ):
             refusal = SignalError if what == "speed" else CurrentError
             raise refusal(
                 f"{where}: swapped sign, {what} runs against the voltage "
                 f"(correlation {-found.wrong:.2f}); {remedy}"
             )
-        follows = found.wrong > max(least, min(sure, limits.SIGN_ALIKE))
-        if late and what == "speed" and follows and found.wrong > limits.SIGN_NEARER * found.right:
+        follows = found.wrong > max(least, min(sure, limits.MIN_TURNING_CORRELATION))
+        if (
+            late
+            and what == "speed"
+            and follows
+            and found.wrong > limits.MIN_WRONG_SIGN_RATIO * found.right
+        ):
             period = _find_sign_period(records)
             raise InsufficientExcitationError(
                 f"{where}: the voltage changes too fast, with a period of {period:.2g} "
@@ -279,7 +286,7 @@ def _select_turning(records: Sequence[Record]) -> list[Record]:
     return [
         r
         for r, s in zip(records, scatter, strict=True)
-        if len(records) > 1 and s > limits.REST * max(scatter)
+        if len(records) > 1 and s > limits.MAX_REST_VOLTAGE * max(scatter)
     ]
 
 

@@ -14,11 +14,11 @@ from numpy.fft import irfft, rfft
 from smp_motor_control.arrays import Array
 from smp_motor_ident.errors import SignalError
 from smp_motor_ident.limits import (
-    BACKWARD,
-    HALF_EXPLAINED,
-    SIGN_LATE,
-    SIGN_LEAST,
-    SIGN_SURE,
+    MAX_BACKWARD_SHARE,
+    MAX_SIGN_DELAY,
+    MIN_EXPLAINED_SHARE,
+    MIN_SIGN_CORRELATION,
+    MIN_SIGN_STDS,
 )
 from smp_motor_ident.quality.lag import apply_lag
 from smp_motor_ident.record import Record
@@ -59,7 +59,7 @@ def correlate_with_voltage(
         late = [(apply_lag(v, lag / step), y) for step, v, y in fewer]
         products = [
             sum(float(x[: x.size - k] @ y[k:]) for x, y in late)
-            for k in range(int(SIGN_LATE / every) + 1)
+            for k in range(int(MAX_SIGN_DELAY / every) + 1)
         ]
         square = sum(float(x @ x) for x, _ in late)
         next_to = sum(float(2 * (x[1:] @ x[:-1]) - x[-1] ** 2) for x, _ in late)
@@ -71,7 +71,7 @@ def correlate_with_voltage(
         for alike, half in ((whole, 1), (both, 2)):
             if alike.min(initial=0.0) < worst:
                 worst, reverse = float(alike.min()), [(_average(x, half), y) for x, y in late]
-    if -worst <= SIGN_LEAST:  # chance is then irrelevant
+    if -worst <= MIN_SIGN_CORRELATION:  # chance is then irrelevant
         return SignCorrelation(best, -worst, np.inf)
     sizes = [float(np.sqrt((x @ x) * (y @ y))) for x, y in reverse]
     spread = [size * _compute_chance_std(x, y) for size, (x, y) in zip(sizes, reverse, strict=True)]
@@ -125,7 +125,7 @@ def refuse_lost_sign(records: Sequence[Record], speeds: Sequence[Array], where: 
     lowest = min(float(np.nanmin(r.voltage)) for r in records)
     ways = np.concatenate([_sum_travel(r, w) for r, w in zip(records, speeds, strict=True)])
     way, back = float(np.abs(ways).sum()), -float(np.minimum(ways, 0.0).sum())
-    if lowest >= 0 and back > BACKWARD * way and way - back > BACKWARD * way:
+    if lowest >= 0 and back > MAX_BACKWARD_SHARE * way and way - back > MAX_BACKWARD_SHARE * way:
         raise SignalError(
             f"{where}: the voltage is never negative, though {100 * back / way:.0f} % of the way "
             "is backwards: it has no sign; map its direction with direction=COLUMN, or record a "
@@ -146,7 +146,7 @@ def _sum_travel(record: Record, speed: Array) -> Array:
     squares = np.add.reduceat(np.square(np.diff(speed, prepend=speed[:1])), starts)
     # The errors of all speeds add up, of the differences of angles those at the two ends.
     share = 1 / np.diff(starts, append=speed.size) if record.velocity is None else 0.5
-    return np.where(np.abs(ways) > SIGN_SURE * np.sqrt(squares * share), ways, 0.0)
+    return np.where(np.abs(ways) > MIN_SIGN_STDS * np.sqrt(squares * share), ways, 0.0)
 
 
 def _is_magnitude(record: Record) -> bool:
@@ -162,7 +162,7 @@ def _is_magnitude(record: Record) -> bool:
         made = apply_lag(volts, float(lag))[known]
         found.append([_compute_r_squared(x, speed[known]) for x in (made, np.abs(made))])
     signed, size = np.max(found, axis=0)
-    return bool(size > HALF_EXPLAINED and signed < HALF_EXPLAINED * size)
+    return bool(size > MIN_EXPLAINED_SHARE and signed < MIN_EXPLAINED_SHARE * size)
 
 
 def _compute_r_squared(x: Array, y: Array) -> float:

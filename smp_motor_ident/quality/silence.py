@@ -11,7 +11,12 @@ from smp_motor_control.arrays import Array, Flags
 from smp_motor_ident._compile import compiled
 from smp_motor_ident.errors import SignalError
 from smp_motor_ident.finding import Finding
-from smp_motor_ident.limits import FEWEST, FLICKER, LEFT_BY_SILENCE, SILENT_SWING
+from smp_motor_ident.limits import (
+    MIN_FLICKER_RATIO,
+    MIN_REMAINING_SHARE,
+    MIN_SAMPLES,
+    MIN_SILENT_SWING,
+)
 from smp_motor_ident.quality.lag import apply_lag
 from smp_motor_ident.record import Record
 
@@ -35,7 +40,7 @@ def remove_silences(record: Record) -> Record:
 
     The rest determines the motor, whether the shaft was blocked or the encoder came loose.
     """
-    least = LEFT_BY_SILENCE * len(record)
+    least = MIN_REMAINING_SHARE * len(record)
     while found := next((s for s in _find_silences(record) if s[2] + 1 < len(record)), None):
         name, a, b = found
         rows = np.ones(len(record), dtype=np.bool_)
@@ -85,7 +90,7 @@ def _find_silences(record: Record) -> Iterator[tuple[str, int, int]]:
         still, rest = record.voltage[a + 1 : b], np.delete(record.voltage, np.arange(a, b))
         if np.abs(still).mean() <= 0.5 * np.abs(rest).mean():
             continue
-        if _predict_swing(record, name, a, b) > SILENT_SWING:
+        if _predict_swing(record, name, a, b) > MIN_SILENT_SWING:
             yield name, a, b
 
 
@@ -103,14 +108,14 @@ def _predict_swing(record: Record, name: str, a: int, b: int) -> float:
     known = np.isfinite(speed)
     known[a : b + 1] = False
     known[list(record.starts)] = False
-    if known.sum() < FEWEST or not levels.size:
+    if known.sum() < MIN_SAMPLES or not levels.size:
         return float("inf")  # nothing says how the motor answers
     expected, least = _predict_speed(record, speed, known), float(levels.min())
     if name == "velocity":
         # Differences of counts flicker, so that their mean resolves less than a step; a rounded
         # speed changes only where the motion crosses to the next level.
         changes = np.count_nonzero(np.diff(speed[known]))
-        if changes < FLICKER * np.abs(np.diff(expected[known])).sum() / least:
+        if changes < MIN_FLICKER_RATIO * np.abs(np.diff(expected[known])).sum() / least:
             return float(np.abs(expected[a:b]).max() / least)
         least *= float(np.median(step))
     turns = np.flatnonzero(np.diff(np.sign(expected[a:b]), prepend=np.nan) != 0)

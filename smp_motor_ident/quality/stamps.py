@@ -22,9 +22,9 @@ from smp_motor_ident.limits import (
     BEAT_FLOOR,
     BEAT_JITTER,
     BEAT_LOST,
-    BUNCHED,
-    ROWS_LOST,
-    SMOOTHER,
+    MAX_BRIDGED_ROWS,
+    MAX_BUNCHED_INTERVAL,
+    MIN_SMOOTHER_STDS,
 )
 from smp_motor_ident.record import Record
 
@@ -71,7 +71,7 @@ def find_beat(arrival: Integers) -> Beat | None:
     latency, period = np.concatenate(late), float(np.median(periods))
     if np.std(latency) < BEAT_JITTER * period or np.any(np.diff(time) <= 0):
         return None
-    repeated = float(np.mean(np.diff(arrival) < BUNCHED * period)) > BEAT_LOST
+    repeated = float(np.mean(np.diff(arrival) < MAX_BUNCHED_INTERVAL * period)) > BEAT_LOST
     return Beat(time, period, max(deviations), float(np.median(latency)), repeated)
 
 
@@ -81,7 +81,9 @@ def _fit_beat(arrival: Integers) -> tuple[Array, float, float] | None:
     usual = since[-1] / (since.size - 1)
     if usual <= 0:
         return None
-    apart = np.flatnonzero(np.diff(since, prepend=-np.inf, append=np.inf) > BUNCHED * usual)
+    apart = np.flatnonzero(
+        np.diff(since, prepend=-np.inf, append=np.inf) > MAX_BUNCHED_INTERVAL * usual
+    )
     longest = int(np.diff(apart).max(initial=1))  # samples that came at once
     window = max(32, 4 * longest)
     if 4 * window > since.size:
@@ -184,7 +186,7 @@ def is_on_beat(beat: Beat, arrival: Integers, motion: Array) -> bool:
     nearer = np.minimum(kept, put_back)
     apart = np.abs(kept - put_back) > 2.0 * np.quantile(nearer, 0.95)
     votes = np.sign(kept - put_back)[apart]
-    return bool(votes.sum() > SMOOTHER * np.sqrt(votes.size))
+    return bool(votes.sum() > MIN_SMOOTHER_STDS * np.sqrt(votes.size))
 
 
 def _measure_curvature(time: Integers, value: Array) -> Array:
@@ -245,7 +247,7 @@ def merge_bunches(record: Record) -> Record:
     within[starts[1:] - 1] = False
     if not within.any():
         return record
-    near = BUNCHED * float(step[within].mean())
+    near = MAX_BUNCHED_INTERVAL * float(step[within].mean())
     usual = record.sample_time if within.all() else float(np.median(step[within]))
     if usual >= near:
         return record
@@ -294,9 +296,9 @@ def interpolate_lost_voltage(record: Record) -> Record:
     share = step / np.repeat(usual, np.diff(edges))[:-1]
     whole = np.rint(share)
     regular = np.abs(share - whole) < INTERVAL_TOLERANCE
-    few = (whole > 1) & (whole <= 1 + ROWS_LOST)
+    few = (whole > 1) & (whole <= 1 + MAX_BRIDGED_ROWS)
     few[np.array(record.starts[1:], dtype=np.int64) - 1] = False
-    if not few.any() or not regular.all(where=whole <= 1 + ROWS_LOST):
+    if not few.any() or not regular.all(where=whole <= 1 + MAX_BRIDGED_ROWS):
         return record
     k = np.flatnonzero(few)
     voltage, m = record.voltage.copy(), whole[k]

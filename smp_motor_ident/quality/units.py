@@ -11,11 +11,11 @@ from smp_motor_ident.errors import SignalError
 from smp_motor_ident.finding import Finding
 from smp_motor_ident.limits import (
     EXTRA_LOW_VOLTAGE,
-    FAST_MOTOR,
-    HIGHEST_GAIN,
-    HIGHEST_SPEED,
-    LONGEST_LAG,
     LOW_VOLTAGE,
+    MAX_DC_GAIN,
+    MAX_MOTOR_SPEED,
+    MAX_TIME_CONSTANT,
+    MAX_USUAL_SPEED,
 )
 from smp_motor_ident.record import Hardware, Record
 
@@ -101,9 +101,9 @@ def check_plausibility(
     speed = gain * max(top - friction, 0.0)
     words = f"a speed of {speed * 30 / math.pi:.3g} rpm at {top:.3g} V"
     odd = {
-        f"a time constant of {lag:.3g} s": lag > LONGEST_LAG,
-        f"a gain of {gain:.3g} rad/s per volt": gain > HIGHEST_GAIN,
-        words: speed > HIGHEST_SPEED,
+        f"a time constant of {lag:.3g} s": lag > MAX_TIME_CONSTANT,
+        f"a gain of {gain:.3g} rad/s per volt": gain > MAX_DC_GAIN,
+        words: speed > MAX_MOTOR_SPEED,
     }
     numbers: dict[str, float | str | None]
     numbers = {"time_constant": lag, "dc_gain": gain, "speed": speed, "voltage": top}
@@ -114,6 +114,6 @@ def check_plausibility(
     if any(odd.values()):
         said = f"no motor has {' and '.join(word for word, there in odd.items() if there)}"
         yield Finding("implausible_motor", "warning", said, numbers, advice)
-    elif speed > FAST_MOTOR:
+    elif speed > MAX_USUAL_SPEED:
         said = f"the motor has {words}; among brushed motors, only those of toys do"
         yield Finding("fast_motor", "warning", said, numbers, advice)

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from smp_motor_control.arrays import Array
-from smp_motor_ident.limits import FLEET_DRIFT, FLEET_OUTLIER, FLEET_SIZE
+from smp_motor_ident.limits import MIN_FLEET_DRIFT, MIN_FLEET_OUTLIER, MIN_FLEET_SIZE
 from smp_motor_ident.report import templates, words
 from smp_motor_ident.result import UNITS, Quantity
 
@@ -71,7 +71,7 @@ def drifts(rows: Sequence[Row]) -> list[Mark]:
         rest = (value - mean - slope * (day - middle)) / std
         scatter = max(1.0, float(np.sum(rest**2)) / (len(held) - 2))
         deviation = math.sqrt(scatter * stated[0, 0])
-        if abs(slope) > FLEET_DRIFT * deviation:
+        if abs(slope) > MIN_FLEET_DRIFT * deviation:
             shown = Quantity(3000 * slope / mean, abs(3000 * deviation / mean), unit="%")
             text = (
                 f"changes by {words.state(shown)} in 30 days, {abs(slope) / deviation:.1f} "
@@ -97,13 +97,13 @@ def outliers(rows: Sequence[Row]) -> list[Mark]:
     marks = []
     for (_, wheel, name), held in _grouped(rows, lambda r: "").items():
         last = list({r.robot: r for r in sorted(held, key=lambda r: r.date or 0.0)}.values())
-        if len(last) < FLEET_SIZE:
+        if len(last) < MIN_FLEET_SIZE:
             continue
         value, std = _numbers(last, name)
         middle = float(np.median(value))
         spread = np.hypot(1.4826 * np.median(np.abs(value - middle)), std)
         for row, one, wide in zip(last, value, spread, strict=True):
-            if wide > 0 and abs(one - middle) > FLEET_OUTLIER * wide:
+            if wide > 0 and abs(one - middle) > MIN_FLEET_OUTLIER * wide:
                 shown = words.state(row.values[name])
                 text = (
                     f"is {shown}, {100 * (one / middle - 1):+.2g} % from the median of "

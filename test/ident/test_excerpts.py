@@ -6,7 +6,7 @@ import numpy as np
 
 from smp_motor_ident.cli.identification import identify_wheel
 from smp_motor_ident.estimate import estimate
-from smp_motor_ident.limits import EXCERPT
+from smp_motor_ident.limits import MAX_EXCERPT_ROWS
 from smp_motor_ident.quality.excitation import STRETCH_COUNT, select_excerpts
 from smp_motor_ident.record import Record
 
@@ -44,7 +44,7 @@ def test_the_stretches_of_a_long_record_tell_its_motor() -> None:
 
 
 def test_identify_uses_and_shows_stretches_of_a_long_record() -> None:
-    rows = round(1.2 * EXCERPT)
+    rows = round(1.2 * MAX_EXCERPT_ROWS)
     rng = np.random.default_rng(0)
     time = 0.001 * np.arange(rows)
     voltage = np.repeat(rng.uniform(-6.0, 6.0, rows // 100), 100)
