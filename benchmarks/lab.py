@@ -112,11 +112,8 @@ def main() -> int:
         connect("benchmark") as client,
     ):
         folder = Path(name)
-        robot = demonstration.start(
-            steps.Robot(processes, client, WHEELS, folder),
-            find_config(PAPER_MOTORS),
-            arguments.rate,
-        )
+        robot = steps.Robot(processes, client, WHEELS, folder)
+        demonstration.start(robot, find_config(PAPER_MOTORS), arguments.rate)
         gains = applying.from_file(find_config("gains.yaml"))
         client.set_parameters({get_controller_name(w): values for w, values in gains.items()})
         robot.switch("activate")

@@ -136,7 +136,7 @@ def try_gains(
             one.begin()
         start = time.monotonic()
         pending_restore = dict(client.pending_restore)
-        gains = {**pending_restore.get("gains", {}), **old}
+        gains = {**old, **pending_restore.get("gains", {})}  # those of an earlier trial are older
         client.set_pending_restore(**{**pending_restore, "gains": gains})
         try:
             client.set_parameters({get_controller_name(w): new for w, new in values.items()})
@@ -181,7 +181,8 @@ def _wait_for_missing(
     say: Callable[[str], None],
 ) -> list[str]:
     """Wait for wheels that do not answer, and restore their gains when they return."""
-    gains = {node: old[node] for node in missing}
+    pending = client.pending_restore.get("gains", {})
+    gains = {node: v for node, v in pending.items() if node not in old or node in missing}
     client.set_pending_restore(**{**client.pending_restore, "gains": gains})
     names = ", ".join(node.partition("/")[0] for node in missing)
     say(

@@ -30,6 +30,7 @@ COLUMNS = ("voltage", "current", "speed", "setpoint", "reference", "prediction")
 
 SLOT_S = 0.005  # interval of the common time grid; the last sample in it counts
 MAX_LATE_SLOTS = 4  # slots by which one wheel's samples may come after another's
+MAX_OFFSET_SLOTS = 200  # slots by which a stream may lag; more shows a clock that was set
 FRAME_S = 1 / 30  # period of batches and of commands
 KEPT_S = 60.0  # length of the kept history
 COMMAND_S = 0.3  # age at which a command ends
@@ -73,7 +74,7 @@ class History:
         """Put samples of one wheel into their slots."""
         slots = (stamps / SLOT_S).astype(np.int64)
         size, newest = len(self._rows), int(slots[-1])
-        if not 0 <= newest - self.newest < size and abs(newest - self.newest) > MAX_LATE_SLOTS:
+        if self.newest < 0 or not -MAX_OFFSET_SLOTS <= newest - self.newest < size:
             self._rows[:] = math.nan  # the first samples, or the clock was set
             self.newest = self._told = newest
             self.origin = newest if self.origin < 0 else self.origin
@@ -102,7 +103,8 @@ class LiveLink:
 
     The listener has ``on_frame(slots, rows)`` for a batch of samples, shape (slots,) and
     (slots, wheels, columns), ``on_learned(wheel, message)`` for ``MotorParameters``,
-    ``on_halt(reason)`` once the wheels were stopped, and ``on_tick()`` for every period.
+    ``interrupt()`` to end at once what moves them, ``on_halt(reason)`` once the wheels were
+    stopped, and ``on_tick()`` for every period.
     """
 
     def __init__(self, client: RobotClient, wheels: Sequence[str], listener: Any) -> None:
@@ -112,7 +114,7 @@ class LiveLink:
         self.diagnostics: dict[str, tuple[float, int, str]] = {}
         self.armed = self.controlled = False  # whether commands pass; controllers are active
         self.watched_at = -math.inf  # when it was last known that the sender of commands lives
-        self._halt = ""
+        self._halt, self.halts = "", 0  # reason of a halt that is due; number of halts
         self._plans: tuple[float, Mapping[str, Plan], float] | None = None
         self._body = (0.0, 0.0, -math.inf)  # m/s, rad/s, when commanded
         node = client.node
@@ -150,7 +152,9 @@ class LiveLink:
 
     def halt(self, reason: str) -> None:
         """Stop the wheels within a period and refuse commands until they are armed again."""
-        self._halt = self._halt or reason
+        self._halt, self.halts = self._halt or reason, self.halts + 1
+        if self.armed:
+            self._listener.interrupt()
 
     def drive(self, linear: float, angular: float) -> None:
         """Command the body [m/s], [rad/s]; it stops when no further command comes."""
@@ -176,14 +180,13 @@ class LiveLink:
 
     def _on_timer(self) -> None:
         now = time.monotonic()
-        self._read()
         if self.armed and now - self.watched_at > UNWATCHED_S:
             self.halt(f"nobody watched the page for {UNWATCHED_S:g} s")
         if self._halt:
             self._stop_wheels()
         linear, angular, at = self._body
         if now - at < COMMAND_S + ZERO_S:
-            fresh = now - at < COMMAND_S
+            fresh = self.armed and now - at < COMMAND_S
             self._send_twist(*((linear, angular) if fresh else (0.0, 0.0)))
         if self._plans is not None:
             begun, plans, duration = self._plans
@@ -195,7 +198,11 @@ class LiveLink:
                     wheel: next((v for t, v in reversed(plan) if since >= t), 0.0)
                     for wheel, plan in plans.items()
                 })  # fmt: skip
-        self._listener.on_tick()
+        try:
+            self._read()
+            self._listener.on_tick()
+        except Exception as error:  # the wheels are still to be stopped
+            self.halt(f"the streams failed with {error!r}")
 
     def _read(self) -> None:
         for kind, numbers, wheel, columns, stream in self._streams:

@@ -328,7 +328,8 @@ class RobotClient:
     def restore(self, pending_restore: Mapping[str, Any]) -> None:
         """Halt the wheels, set the previous gains and activate the controllers that were active."""
         if pending_restore.get("halt"):
-            self.ask_all(ChangeState, _halts(pending_restore))
+            with contextlib.suppress(RobotError):  # one that is missing keeps no other moving
+                self.ask_all(ChangeState, _halts(pending_restore), HALT_S)
             self.spin(HALT_S)
         if pending_restore.get("gains"):
             self.set_parameters(pending_restore["gains"])
@@ -374,13 +375,18 @@ class RobotClient:
             nodes = list(map(get_controller_name, controlled))
             active = [node for node, state in self.get_states(nodes).items() if state == "active"]
             self.set_pending_restore(active=active)
-            self.change_states(active, "deactivate")
-            # A node owns a wheel until its lease ends.
-            if not self.until(lambda: not any(owners.values()), TIMEOUT_S):
-                held = ", ".join(
-                    f"{self._absolute_name(w)} by {name}" for w, name in owners.items() if name
-                )
-                raise RobotError(f"still driven after {TIMEOUT_S:g} s: {held}; end it first")
+            try:
+                self.change_states(active, "deactivate")
+                # A node owns a wheel until its lease ends.
+                if not self.until(lambda: not any(owners.values()), TIMEOUT_S):
+                    held = ", ".join(
+                        f"{self._absolute_name(w)} by {name}" for w, name in owners.items() if name
+                    )
+                    raise RobotError(f"still driven after {TIMEOUT_S:g} s: {held}; end it first")
+            except RobotError:
+                self.restore(self.pending_restore)
+                self.set_pending_restore()
+                raise
         try:
             yield
         finally:

@@ -27,7 +27,7 @@ from smp_motor_ident.cli.processes import ProcessError
 from smp_motor_ident.errors import ParameterError
 from smp_motor_ident.report import templates
 
-QUEUED = 60  # messages that wait for a slow page before it is closed
+QUEUED = 60  # messages that wait for a slow page before it gets no more samples
 MAX_MESSAGE = 10_000  # length of a request [bytes]
 WATCH_S, LOST_S = 0.03, 0.3  # interval of watching, and silence that stops the wheels
 ABANDONED_S = 2.0  # silence after which another page may take the place of the one that drives
@@ -49,14 +49,13 @@ class Page:
         self.heard_at = time.monotonic()
 
     async def write(self) -> None:
-        """Send what is queued; leave a page that cannot keep up."""
-        while self.queue.qsize() < QUEUED:
+        """Send what is queued."""
+        while True:
             message = await self.queue.get()
             if isinstance(message, bytes):
                 await self.socket.send_bytes(message)
             else:
                 await self.socket.send_str(message)
-        await self.socket.close(code=1013, message=b"too slow")
 
 
 class Server:
@@ -67,6 +66,7 @@ class Server:
         self._pages: list[Page] = []
         self._driver: Page | None = None
         self._session, self._token = secrets.token_urlsafe(32), ""
+        self._base = f"/{secrets.token_urlsafe(9)}"  # other servers of this host get no cookie
         self._last: dict[str, str] = {}  # the newest message of each kind, for pages that join
         self._loop = asyncio.new_event_loop()
         self._ended = asyncio.Event()
@@ -99,8 +99,8 @@ class Server:
     async def _serve(self, ready: "concurrent.futures.Future[None]") -> None:
         app = web.Application(middlewares=[self._guard])
         app.add_routes([
-            web.get("/", self._page), web.get("/ws", self._talk),
-            web.get("/results/{name}/{file}", self._result),
+            web.get(f"{self._base}/", self._page), web.get(f"{self._base}/ws", self._talk),
+            web.get(f"{self._base}/results/{{name}}/{{file}}", self._result),
         ])  # fmt: skip
         runner = web.AppRunner(app, access_log=None, shutdown_timeout=1.0)
         await runner.setup()
@@ -110,9 +110,9 @@ class Server:
             self._port = runner.addresses[0][1]
             ready.set_result(None)
             await self._watch()
-        except OSError as error:
+        except (OSError, OverflowError) as error:
             where = f"{self._host}:{self._port}"
-            ready.set_exception(ProcessError(f"{where}: {error.strerror}; choose another --port"))
+            ready.set_exception(ProcessError(f"{where}: {error}; choose another --port"))
         finally:
             for page in list(self._pages):
                 await page.socket.close(code=1001, message=b"lab ended")
@@ -120,11 +120,11 @@ class Server:
 
     async def _watch(self) -> None:
         """Stop the wheels when the page that drives is heard no more."""
-        link, before = self._laboratory.link, time.monotonic()
+        link, before, late = self._laboratory.link, time.monotonic(), False
         while not self._ended.is_set():
             await asyncio.sleep(WATCH_S)
             now, driver = time.monotonic(), self._driver
-            late, before = now - before > LOST_S / 2, now
+            late, before = not late and now - before > LOST_S / 2, now
             # After a pause of this process the page may have been heard, and not been read yet.
             if link.armed and not late and (driver is None or now - driver.heard_at > LOST_S):
                 link.halt(f"the page was not heard for {LOST_S:g} s")
@@ -160,14 +160,17 @@ class Server:
             if not secrets.compare_digest(token.encode(), self._token.encode()):
                 raise web.HTTPForbidden(text="lab: the token was used; open the last one printed\n")
             self._invite()
-            answer = web.HTTPFound("/", headers=HEADERS)
-            cookie = f"lab_{self._port}", self._session
-            answer.set_cookie(*cookie, httponly=True, samesite="Strict")
+            answer = web.HTTPFound(f"{self._base}/", headers=HEADERS)
+            cookie = "lab", self._session
+            answer.set_cookie(*cookie, path=self._base, httponly=True, samesite="Strict")
             raise answer
-        known = request.cookies.get(f"lab_{self._port}", "")
+        known = request.cookies.get("lab", "")
         if not secrets.compare_digest(known.encode(), self._session.encode()):
             raise web.HTTPForbidden(text="lab: open the address that it printed, with its token\n")
-        if request.path == "/ws" and request.headers.get("Origin") != f"http://{request.host}":
+        if (
+            request.path.endswith("/ws")
+            and request.headers.get("Origin") != f"http://{request.host}"
+        ):
             raise web.HTTPForbidden(text="lab: another page may not connect\n")
         return await handler(request)
 
@@ -192,14 +195,16 @@ class Server:
         return web.FileResponse(path, headers={**HEADERS, "Content-Security-Policy": REPORT_POLICY})
 
     async def _talk(self, request: web.Request) -> web.WebSocketResponse:
-        socket = web.WebSocketResponse(max_msg_size=MAX_MESSAGE, compress=False)
+        socket = web.WebSocketResponse(heartbeat=5.0, max_msg_size=MAX_MESSAGE, compress=False)
         await socket.prepare(request)
-        page = Page(socket)
+        page, candidates = Page(socket), self._laboratory.candidates
         self._pages.append(page)
-        if self._pages[1:] and self._laboratory.link.armed:
+        if self._pages[1:]:
             self._laboratory.link.halt("another page was opened")
         self._driver = self._driver or page
-        for last in self._last.values():
+        shown = {"ms": None, "asked": 0}
+        made = [templates.encode(["design", {**one, **shown}]) for one in candidates.values()]
+        for last in [*self._last.values(), *made]:
             page.queue.put_nowait(last)
         self._tell_roles()
         tasks = {asyncio.ensure_future(page.write())}
@@ -214,8 +219,7 @@ class Server:
             self._pages.remove(page)
             if page is self._driver:
                 self._driver = None
-                if self._laboratory.link.armed:
-                    self._laboratory.link.halt("the page that drove was closed")
+                self._laboratory.link.halt("the page that drove was closed")
             self._tell_roles()
         return socket
 
@@ -274,10 +278,11 @@ class Server:
 
     def _spread(self, kind: str, content: Any) -> None:
         message = content if kind == "frame" else templates.encode([kind, content])
-        if isinstance(message, str):
+        if kind in ("state", "designs"):
             self._last[kind] = message
         for page in self._pages:
-            page.queue.put_nowait(message)
+            if kind != "frame" or page.queue.qsize() < QUEUED:
+                page.queue.put_nowait(message)
 
 
 def _is_loopback(host: str) -> bool:

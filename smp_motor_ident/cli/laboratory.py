@@ -13,8 +13,9 @@ import queue
 import time
 from collections.abc import Callable, Mapping
 from concurrent.futures import ProcessPoolExecutor
-from contextlib import ExitStack, closing
+from contextlib import ExitStack, closing, suppress
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -34,6 +35,7 @@ from smp_motor_ident.report import words
 from smp_motor_ident.report.document import read_identification
 from smp_motor_ident.result import UNITS, Quantity
 
+MOVING = ("arming", "exciting", "trying gains", "stepping")  # jobs that need the wheels
 TRIAL_S = 2.5  # for which gains on trial are watched
 STEP_AT_S, STEP_LASTS_S = 0.3, 1.2  # begin and length of the step of a trial
 STATE_S = 0.1  # shortest time between two messages about the state
@@ -72,7 +74,8 @@ def work(arguments: argparse.Namespace) -> int:
             robot = steps.Robot(processes, client, wheels or WHEELS, folder, ros, bounds)
             client.wait_for_wheels(robot.wheels, timeout=15.0)
         served = arguments.host, arguments.port, not arguments.no_browser
-        with closing(Laboratory(robot, designs)) as laboratory, Server(laboratory, *served):
+        laboratory = Laboratory(robot, designs)
+        with Server(laboratory, *served), closing(laboratory):
             laboratory.run()
     return 0
 
@@ -100,6 +103,8 @@ class Laboratory:
         self._models: dict[str, Prediction] = {}
         self._recorded: dict[str, list[str]] = {}  # the wheels that each recording excites
         self._before: dict[str, dict[str, Any]] = {}  # parameters of wheels with gains on trial
+        self._tried: dict[str, dict[str, Any]] = {}  # designs that are on trial
+        self._designs: dict[str, dict[str, Any]] = {}  # those of ``tune``, or kept after a trial
         self.candidates: dict[str, dict[str, Any]] = {}  # the design that a page shows, by wheel
         self._told: tuple[float, str] = (0.0, "")
         self._reason = ""
@@ -108,15 +113,16 @@ class Laboratory:
 
     def close(self) -> None:
         """Stop the wheels, and give the controllers back."""
-        client = self.robot.client
         self.link.halt("lab ends")
-        client.spin(2 * STATE_S)
-        self.robot.processes.stop("excite", "record", "identifier", "identify")
-        if self._taken:
-            self._activate(False)
-            self._taken = False
-            self._note()
-        self._stack.close()
+        with self._stack:  # gives the controllers back in any case
+            self.robot.client.spin(2 * STATE_S)
+            self.robot.processes.stop("excite", "record", "identifier", "identify")
+            if self._taken:
+                self._activate(False)
+                if self._before:
+                    self._decide(keep=False)
+                self._taken = False
+                self._note()
 
     def run(self) -> None:
         """Do what the pages ask until Ctrl-C."""
@@ -132,6 +138,8 @@ class Laboratory:
             except Exception as error:  # the wheels are still to be watched and stopped
                 known = isinstance(error, SmpError)
                 self.tell(str(error) if known else f"the request failed: {error!r}", "error")
+                if name in MOVING:
+                    self.link.halt(f"{name} failed")
             finally:
                 self.state["job"] = self.state["progress"] = ""
                 self.link.rest()
@@ -152,8 +160,16 @@ class Laboratory:
         table = np.column_stack([slots - self.link.history.origin, rows.reshape(slots.size, -1)])
         self.send("frame", table.astype("<f4").tobytes())
 
+    def interrupt(self) -> None:
+        """End an excitation at once."""
+        self.robot.processes.interrupt("excite")
+
     def on_learned(self, wheel: str, message: Any) -> None:
         """Show an estimate of the node identifier, and follow its model from now on."""
+        with suppress(SmpError, ArithmeticError, ValueError):  # any node may publish it
+            self._learn(wheel, message)
+
+    def _learn(self, wheel: str, message: Any) -> None:
         found = {
             name: Quantity(value, std, unit=UNITS[name], status="estimated")
             for name, value, std in zip(message.names, message.values, message.std_devs)
@@ -170,8 +186,7 @@ class Laboratory:
             self._models[wheel] = Prediction(model, hardware.gear_ratio)
 
     def on_halt(self, reason: str) -> None:
-        """End an excitation at once, and verify that the controllers are inactive."""
-        self.robot.processes.interrupt("excite")
+        """Verify that the controllers are inactive."""
         self._reason = reason
         self.tell(f"Stopped: {reason}.", "stop")
         if self._taken:
@@ -202,19 +217,20 @@ class Laboratory:
     def ask(self, message: Mapping[str, Any]) -> None:
         """Take a request of the page that drives."""
         jobs: dict[str, tuple[str, Callable[[], None]]] = {
-            "arm": ("arming", self._arm),
+            "arm": ("arming", partial(self._arm, self.link.halts)),
             "excite": ("exciting", lambda: self._excite(message)),
             "discard": ("discarding recordings", self._recorded.clear),
             "identify": ("identifying", self._identify),
             "tune": ("designing", lambda: self._tune(bool(message.get("accept")))),
-            "apply": ("applying gains on trial", lambda: self._apply(str(message["wheel"]))),
+            "apply": ("trying gains", lambda: self._apply(str(message["wheel"]))),
             "step": ("stepping", lambda: self._step(str(message["wheel"]))),
             "keep": ("keeping gains", lambda: self._decide(keep=True)),
             "back": ("taking gains back", lambda: self._decide(keep=False)),
         }
         wanted = str(message["do"])
         if wanted == "drive":
-            self.link.drive(float(message["linear"]), float(message["angular"]))
+            if self.state["job"] not in MOVING:  # which the joystick would disturb
+                self.link.drive(float(message["linear"]), float(message["angular"]))
             return
         if wanted not in jobs:
             raise ParameterError(f"the request {wanted!r} is not known")
@@ -238,7 +254,7 @@ class Laboratory:
                 self.state["progress"] = self.robot.processes.last_line(name)
             self.robot.client.until(done, 0.1)
 
-    def _arm(self) -> None:
+    def _arm(self, halts: int) -> None:
         client, link = self.robot.client, self.link
         if not self._taken:
             if missing := self.robot.uncontrolled():
@@ -248,13 +264,19 @@ class Laboratory:
             self._stack.enter_context(client.paused(self.robot.wheels))
             self._taken = True
             self._note()
+        if link.halts != halts:
+            raise ProcessError("stopped while arming")
         link.watched_at, link.armed = time.monotonic(), True
         self._activate(True)
 
     def _activate(self, active: bool) -> None:
+        if active and not self.link.armed:
+            raise ProcessError(f"stopped: {self._reason}")
         self.link.controlled = self.link.controlled or active
         self.robot.switch("activate" if active else "deactivate")
         self.link.controlled = active
+        if active and not self.link.armed:  # a stop came meanwhile
+            self._activate(False)
 
     def _excite(self, asked: Mapping[str, Any]) -> None:
         wheels = [w for w in self.robot.wheels if w in asked["wheels"]]
@@ -322,7 +344,7 @@ class Laboratory:
         asked = self.designs.submit(lab_designs.design_all, self.folder / name, gains, accept)
         self._wait(asked.done)
         found = asked.result()
-        self.candidates = dict(found["designs"])
+        self._designs, self.candidates = dict(found["designs"]), dict(found["designs"])
         self.send("designs", found)
         self.state["designed"] = {"name": gains.name, "reason": found["reason"]}
         self.tell(f"{gains.name} holds designed gains for {', '.join(found['designs'])}.")
@@ -331,7 +353,7 @@ class Laboratory:
         """Set the gains that the page shows, and restore the old ones if the wheel misbehaves."""
         from smp_motor_control.nodes.gain_trial import try_gains
 
-        made = self.candidates.get(wheel, {})
+        made = self.candidates.get(wheel, {})  # as it is now, whatever the sliders do
         if "parameters" not in made:
             raise ParameterError(f"{wheel or 'no wheel'} has no design to apply; design one first")
         client, new = self.robot.client, dict(made["parameters"])
@@ -340,45 +362,48 @@ class Laboratory:
         self._wait(self.link.is_body_idle, moving=True)
         self._activate(True)
         self.link.follow({wheel: [(0.0, 0.0)]})
-        outcome = try_gains(
-            client, {wheel: {n: v for n, v in new.items() if n in old}}, TRIAL_S,
-            self.state["supply"].get(wheel, 12.0), self.tell, lambda: self._begin_step(wheel),
-        )  # fmt: skip
-        if outcome.reason:
-            raise ProcessError(f"{outcome.reason}; its old gains are restored")
+        first = wheel not in self._before
         self._before.setdefault(wheel, old)
         self._note()
-        self.state["trial"] = {"wheel": wheel, "wheels": sorted(self._before)}
-        self._show_step(wheel)
+        outcome = try_gains(
+            client, {wheel: {n: v for n, v in new.items() if n in old}}, TRIAL_S,
+            self.state["supply"].get(wheel, 12.0), self.tell, lambda: self._begin_step(wheel, made),
+        )  # fmt: skip
+        if outcome.reason:
+            if first and not outcome.missing:
+                del self._before[wheel]
+                self._note()
+            raise ProcessError(f"the gains before were restored: {outcome.reason}")
+        self._tried[wheel] = made
+        self._show_step(wheel, made)
 
     def _step(self, wheel: str) -> None:
-        if wheel not in self.candidates:
+        made = self.candidates.get(wheel, {})
+        if "parameters" not in made:
             raise ParameterError(f"{wheel or 'no wheel'} has no design; design one first")
         self._wait(self.link.is_body_idle, moving=True)
         self._activate(True)
-        self._begin_step(wheel)
+        self._begin_step(wheel, made)
         end = time.monotonic() + STEP_AT_S + STEP_LASTS_S
         self._wait(lambda: time.monotonic() > end, moving=True)
-        self._show_step(wheel)
+        self._show_step(wheel, made)
 
-    def _begin_step(self, wheel: str) -> None:
+    def _begin_step(self, wheel: str, made: Mapping[str, Any]) -> None:
         self._stepped_at = self.link.history.newest
-        change = float(self.candidates[wheel]["change"])
-        plan = [(0.0, 0.0), (STEP_AT_S, change), (STEP_AT_S + STEP_LASTS_S, 0.0)]
+        plan = [(0.0, 0.0), (STEP_AT_S, made["change"]), (STEP_AT_S + STEP_LASTS_S, 0.0)]
         self.link.follow({wheel: plan})
 
-    def _show_step(self, wheel: str) -> None:
+    def _show_step(self, wheel: str, made: Mapping[str, Any]) -> None:
         """Send the measured answer to the step, from the instant of its set-point [s]."""
         slots, rows = self.link.history.since(self._stepped_at)
-        mine = rows[:, self.robot.wheels.index(wheel)]
-        change = float(self.candidates[wheel]["change"])
+        mine, change = rows[:, self.robot.wheels.index(wheel)], made["change"]
         asked = np.flatnonzero(np.abs(mine[:, 3] - change) < 1e-6 * abs(change))
         if asked.size == 0:
             raise ProcessError(f"{wheel} reported no set-point of {change:.3g} rad/s")
         shown = np.arange(asked[0], asked[-1] + 1)
         shown = shown[np.isfinite(mine[shown, self._speed])]
         milliseconds = 1e3 * self._slot_s * (slots[shown] - slots[asked[0]])
-        on = self.candidates[wheel]["charts"]["tuning-step"][0]
+        on = made["charts"]["tuning-step"][0]
         speed = np.interp(on, milliseconds, mine[shown, self._speed], right=np.nan)
         self.send("step", {"wheel": wheel, "speed": speed})
 
@@ -392,8 +417,17 @@ class Laboratory:
         done = ", ".join(sorted(self._before))
         self.tell(f"{done}: {'gains kept' if keep else 'old gains restored'}.")
         self._before.clear()
-        self.state["trial"] = None
         self._note()
+        if keep:
+            self._designs.update(self._tried)
+            self._write()
+        self._tried.clear()
+
+    def _write(self) -> None:
+        """Write the parameters of all wheels, with the gains that were kept."""
+        path = self.folder / f"gains_{next(self._numbers)}.yaml"
+        path.write_text("\n".join(one["yaml"] for one in self._designs.values()), "utf-8")
+        self.state["designed"] = {**self.state["designed"], "name": path.name}
 
     def _note(self) -> None:
         """Let the guard halt the wheels and restore the old gains if this process dies."""
@@ -401,6 +435,7 @@ class Laboratory:
         pending["halt"] = [get_controller_name(w) for w in self.robot.wheels if self._taken]
         pending["gains"] = {get_controller_name(w): old for w, old in self._before.items()}
         self.robot.client.set_pending_restore(**pending)
+        self.state["trial"] = {"wheels": sorted(self._before)} if self._before else None
 
 
 class Prediction:

@@ -26,20 +26,21 @@
     setInterval(() => { if (performance.now() - heard < frozen) send('{"do":"beat"}'); }, 80);
     open();
   }
-  const code = `(${keepConnection})("ws://${location.host}/ws", 1000)`;
+  const code = `(${keepConnection})("ws://${location.host}${location.pathname}ws", 1000)`;
   const worker = new Worker(URL.createObjectURL(new Blob([code], {type: "text/javascript"})));
   const ask = (what, more = {}) => worker.postMessage(JSON.stringify({do: what, ...more}));
   worker.onmessage = ({data}) => {
     if (data === null) {
-      part("role").textContent = "not connected: the wheels are stopped";
-      document.body.classList.add("watching");
+      showRole({drives: false, pages: 1});
+      part("role").textContent = "not connected";
     } else if (typeof data === "string") {
       const [kind, content] = JSON.parse(data);
       ({state: show, role: showRole, designs: showDesigns, design: showDesign, step: showStep, refused: showRefusal})[kind](content);
     } else take(new Float32Array(data));
   };
   setInterval(() => worker.postMessage(""), 100);
-  document.addEventListener("visibilitychange", () => { if (document.hidden && state.armed && role.drives) ask("stop"); });
+  const halt = () => { if (role.drives && (state.armed || state.job)) ask("stop"); };
+  document.addEventListener("visibilitychange", () => { if (document.hidden) halt(); });
 
   // Samples: one row for each slot of time, the columns of every wheel --------------------------------
 
@@ -53,7 +54,7 @@
     if (table[0] * state.slot < times.at(-1)) { times.length = 0; values.forEach(one => { one.length = 0; }); }
     for (let at = 0; at < table.length; at += width) {
       times.push(table[at] * state.slot);
-      for (let k = 1; k < width; k++) values[k - 1].push(Number.isNaN(table[at + k]) ? null : table[at + k]);
+      for (let k = 1; k < width; k++) values[k - 1].push(Number.isFinite(table[at + k]) ? table[at + k] : null);
     }
     const old = times.findIndex(t => t > times.at(-1) - KEPT);
     if (old > 1000) { times.splice(0, old); values.forEach(one => one.splice(0, old)); }
@@ -89,7 +90,7 @@
     plots.push(u);
     new ResizeObserver(() => { if (place.clientWidth && place.clientWidth !== u.width) u.setSize({width: place.clientWidth, height: HEIGHT[kind]}); }).observe(place);
   }
-  for (const place of document.querySelectorAll(".wheel .plot")) plot(place, place.closest(".wheel").id, place.dataset.kind);
+  for (const place of document.querySelectorAll(".wheel .plot")) plot(place, place.closest(".wheel").dataset.wheel, place.dataset.kind);
 
   const range = () => zoomed || [times.at(-1) - Number(part("window").value), times.at(-1)];
   function draw() {
@@ -102,7 +103,7 @@
   }
   function tell() {
     for (const wheel of state.wheels) {
-      const panel = part(wheel), now = name => before(column(wheel, name), pointed == null ? times.length - 1 : from(pointed)), text = (v, unit) => v == null ? "–" : `${(Math.round(100 * v) / 100 + 0).toFixed(2)} ${unit}`;
+      const panel = part(`wheel-${wheel}`), now = name => before(column(wheel, name), pointed == null ? times.length - 1 : from(pointed)), text = (v, unit) => v == null ? "–" : `${(Math.round(100 * v) / 100 + 0).toFixed(2)} ${unit}`;
       const target = now("setpoint"), speed = now("speed");
       for (const [name, value, unit] of [["speed", speed, "rad/s"], ["setpoint", target, "rad/s"], ["error", target == null || speed == null ? null : target - speed, "rad/s"], ["voltage", now("voltage"), "V"], ["current", now("current"), "A"]])
         panel.querySelector(`.${name}`).textContent = text(value, unit);
@@ -147,16 +148,16 @@
     list("diagnostics", state.diagnostics.map(([name, level, text]) => ["", `${name}: ${["", "warning: ", "error: ", "stale: "][level]}${text}`]));
     for (const wheel of state.wheels) {
       const [, level, text] = state.diagnostics.find(([name]) => name.endsWith(`${wheel}/wheel_pid`)) || ["", 0, "no wheel_pid"];
-      Object.assign(part(wheel).querySelector(".health"), {textContent: text, className: `small health ${["", "warn", "bad", "bad"][level]}`});
+      Object.assign(part(`wheel-${wheel}`).querySelector(".health"), {textContent: text, className: `small health ${["", "warn", "bad", "bad"][level]}`});
     }
     if (changed(old.signals, state.signals)) { part("signal").replaceChildren(...state.signals.map(name => make("option", name))); part("signal").value = "fourier"; }
     part("recordings").textContent = state.recordings.length ? `Recorded: ${state.recordings.join(", ")}.` : "No recording.";
     if (changed(old.motors, state.motors)) showMotors(state.motors);
-    if (old.identified !== state.identified) part("report").src = state.identified ? `/results/${state.identified}/report.html` : "about:blank";
+    if (old.identified !== state.identified) part("report").src = state.identified ? `results/${state.identified}/report.html` : "about:blank";
     const made = state.designed;
     part("designed").textContent = made ? `${made.name}: ${made.reason}.` : "No design.";
     part("gains").hidden = !made;
-    if (made) { part("gains").href = `/results/gains/${made.name}`; part("gains").download = made.name; }
+    if (made) { part("gains").href = `results/gains/${made.name}`; part("gains").download = made.name; }
     part("trial").textContent = state.trial ? `On trial: ${state.trial.wheels.map(label).join(", ")}. Keep the gains, or take them back.` : "";
     part("cannot").textContent = state.drives ? "Drag, or hold the arrow keys; the wheels stop on release." : "No node takes cmd_vel: start skid_steer to drive.";
     enable();
@@ -182,7 +183,7 @@
     for (const one of document.querySelectorAll("fieldset")) one.disabled = !role.drives;
     for (const id of ["share", "phase_margin", "p", "i", "d"]) part(id).disabled = !role.drives || !Object.keys(designs).length;
   }
-  function showRefusal(text) { list("messages", [["refused", text]]); waiting = false; }
+  function showRefusal(text) { list("messages", [["refused", text]]); waiting = false; pending = null; }
 
   for (const what of ["arm", "stop", "take", "discard", "identify", "keep", "back"]) part(what).addEventListener("click", () => ask(what));
   part("excite").addEventListener("click", () => ask("excite", {wheels: [...document.querySelectorAll(".excited:checked")].map(one => one.value), signal: part("signal").value, amplitude: part("amplitude").valueAsNumber, seconds: part("seconds").valueAsNumber}));
@@ -196,6 +197,7 @@
   function showDesigns(content) {
     designs = content.designs;
     measured = {};
+    Object.values(figures).forEach(u => u.destroy());
     part("tune-charts").replaceChildren();
     for (const chart of content.charts) {
       chart.curves[0].name = "designed";
@@ -233,10 +235,10 @@
   function request(values) {
     if (waiting) { pending = values; return; }
     waiting = true;
-    ask("design", {wheel: part("wheel").value, asked: ++counter, ...values});
+    ask("design", {asked: ++counter, ...values});
   }
-  for (const id of ["share", "phase_margin"]) part(id).addEventListener("input", () => request({share: Number(part("share").value), phase_margin: Number(part("phase_margin").value)}));
-  for (const id of ["p", "i", "d"]) part(id).addEventListener("input", () => request(Object.fromEntries(["p", "i", "d"].map(name => [name, part(name).valueAsNumber]))));
+  for (const id of ["share", "phase_margin"]) part(id).addEventListener("input", () => request({wheel: part("wheel").value, share: Number(part("share").value), phase_margin: Number(part("phase_margin").value)}));
+  for (const id of ["p", "i", "d"]) part(id).addEventListener("input", () => request({wheel: part("wheel").value, ...Object.fromEntries(["p", "i", "d"].map(name => [name, part(name).valueAsNumber]))}));
   part("wheel").addEventListener("change", () => { if (designs[part("wheel").value]) showDesign({...designs[part("wheel").value], asked: null}); });
 
   // Driving -------------------------------------------------------------------------------------------
@@ -255,13 +257,14 @@
   const KEYS = {ArrowUp: [0, 1], ArrowDown: [0, -1], ArrowLeft: [-1, 0], ArrowRight: [1, 0], w: [0, 1], s: [0, -1], a: [-1, 0], d: [1, 0]};
   const follow = () => move(...[...held].map(key => KEYS[key]).reduce(([x, y], [a, b]) => [x + a, y + b], [0, 0]));
   addEventListener("keydown", event => {
-    if (event.key === " " && state.armed) { ask("stop"); event.preventDefault(); event.stopPropagation(); return; }
+    if (event.key === " " && (state.armed || state.job)) { ask("stop"); event.preventDefault(); event.stopPropagation(); return; }
     const key = event.key.length === 1 ? event.key.toLowerCase() : event.key;
     if (!KEYS[key] || document.activeElement !== pad) return;
     held.add(key); follow(); event.preventDefault();
   }, true);
   addEventListener("keyup", event => { if (held.delete(event.key.length === 1 ? event.key.toLowerCase() : event.key)) follow(); });
   for (const source of [pad, window]) source.addEventListener("blur", () => { held.clear(); move(0, 0); });
+  addEventListener("blur", () => { if (document.activeElement === part("report")) halt(); });  // it hears no space bar
   setInterval(() => {
     for (const [id, unit] of [["linear", "m/s"], ["angular", "rad/s"]]) part(`${id}-shown`).textContent = `${Number(part(id).value).toFixed(2)} ${unit}`;
     const driving = role.drives && state.armed && (stick[0] !== 0 || stick[1] !== 0);
