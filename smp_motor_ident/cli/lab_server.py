@@ -100,7 +100,7 @@ class Server:
         app = web.Application(middlewares=[self._guard])
         app.add_routes([
             web.get(f"{self._base}/", self._page), web.get(f"{self._base}/ws", self._talk),
-            web.get(f"{self._base}/results/{{name}}/{{file}}", self._result),
+            web.get(f"{self._base}/results/{{name:.+}}", self._result),
         ])  # fmt: skip
         runner = web.AppRunner(app, access_log=None, shutdown_timeout=1.0)
         await runner.setup()
@@ -183,16 +183,15 @@ class Server:
         return web.Response(text=text, content_type="text/html", headers=headers)
 
     async def _result(self, request: web.Request) -> web.StreamResponse:
-        """Serve a report, or a file of gains."""
-        name, file = request.match_info["name"], request.match_info["file"]
-        state, folder = self._laboratory.state, self._laboratory.folder
-        if file == "report.html" and name == state["identified"]:
-            path = folder / name / file
-        elif name == "gains" and file == (state["designed"] or {}).get("name"):
-            path = folder / file
-        else:
+        """Serve the report, or the parameter file."""
+        state, name = self._laboratory.state, request.match_info["name"]
+        if name not in (
+            f"{state['identified']}/report.html",
+            (state["designed"] or {}).get("name"),
+        ):
             raise web.HTTPNotFound(text="lab: no such result\n")
-        return web.FileResponse(path, headers={**HEADERS, "Content-Security-Policy": REPORT_POLICY})
+        headers = {**HEADERS, "Content-Security-Policy": REPORT_POLICY}
+        return web.FileResponse(self._laboratory.folder / name, headers=headers)
 
     async def _talk(self, request: web.Request) -> web.WebSocketResponse:
         socket = web.WebSocketResponse(heartbeat=5.0, max_msg_size=MAX_MESSAGE, compress=False)

@@ -108,6 +108,7 @@ class Laboratory:
         self.candidates: dict[str, dict[str, Any]] = {}  # the design that a page shows, by wheel
         self._told: tuple[float, str] = (0.0, "")
         self._reason = ""
+        self.interrupt = partial(robot.processes.interrupt, "excite")  # ends an excitation at once
         self._stack = ExitStack()
         self._taken = False  # whether the controllers are this laboratory's
 
@@ -160,20 +161,12 @@ class Laboratory:
         table = np.column_stack([slots - self.link.history.origin, rows.reshape(slots.size, -1)])
         self.send("frame", table.astype("<f4").tobytes())
 
-    def interrupt(self) -> None:
-        """End an excitation at once."""
-        self.robot.processes.interrupt("excite")
-
     def on_learned(self, wheel: str, message: Any) -> None:
         """Show an estimate of the node identifier, and follow its model from now on."""
-        with suppress(SmpError, ArithmeticError, ValueError):  # any node may publish it
-            self._learn(wheel, message)
-
-    def _learn(self, wheel: str, message: Any) -> None:
         found = {
             name: Quantity(value, std, unit=UNITS[name], status="estimated")
             for name, value, std in zip(message.names, message.values, message.std_devs)
-            if name in UNITS
+            if name in UNITS and math.isfinite(value + std)  # any node may publish it
         }
         self.state["motors"][wheel] = {
             "state": message.status, "findings": [],
@@ -183,7 +176,8 @@ class Laboratory:
         hardware = self.link.hardware.get(wheel)
         model = {n: float(found[n].value or 0.0) for n in COMBINATIONS if n in found}
         if hardware is not None and {"dc_gain", "time_constant"} <= set(model):
-            self._models[wheel] = Prediction(model, hardware.gear_ratio)
+            with suppress(SmpError):
+                self._models[wheel] = Prediction(model, hardware.gear_ratio)
 
     def on_halt(self, reason: str) -> None:
         """Verify that the controllers are inactive."""
@@ -353,14 +347,9 @@ class Laboratory:
         """Set the gains that the page shows, and restore the old ones if the wheel misbehaves."""
         from smp_motor_control.nodes.gain_trial import try_gains
 
-        made = self.candidates.get(wheel, {})  # as it is now, whatever the sliders do
-        if "parameters" not in made:
-            raise ParameterError(f"{wheel or 'no wheel'} has no design to apply; design one first")
-        client, new = self.robot.client, dict(made["parameters"])
-        node = get_controller_name(wheel)
+        made = self._take(wheel)
+        client, new, node = self.robot.client, made["parameters"], get_controller_name(wheel)
         old = client.get_parameters({node: list(new)})[node]
-        self._wait(self.link.is_body_idle, moving=True)
-        self._activate(True)
         self.link.follow({wheel: [(0.0, 0.0)]})
         first = wheel not in self._before
         self._before.setdefault(wheel, old)
@@ -378,15 +367,20 @@ class Laboratory:
         self._show_step(wheel, made)
 
     def _step(self, wheel: str) -> None:
+        made = self._take(wheel)
+        self._begin_step(wheel, made)
+        end = time.monotonic() + STEP_AT_S + STEP_LASTS_S
+        self._wait(lambda: time.monotonic() > end, moving=True)
+        self._show_step(wheel, made)
+
+    def _take(self, wheel: str) -> dict[str, Any]:
+        """Return the design that the page shows now, and make the wheels ready for it."""
         made = self.candidates.get(wheel, {})
         if "parameters" not in made:
             raise ParameterError(f"{wheel or 'no wheel'} has no design; design one first")
         self._wait(self.link.is_body_idle, moving=True)
         self._activate(True)
-        self._begin_step(wheel, made)
-        end = time.monotonic() + STEP_AT_S + STEP_LASTS_S
-        self._wait(lambda: time.monotonic() > end, moving=True)
-        self._show_step(wheel, made)
+        return made
 
     def _begin_step(self, wheel: str, made: Mapping[str, Any]) -> None:
         self._stepped_at = self.link.history.newest
@@ -418,16 +412,12 @@ class Laboratory:
         self.tell(f"{done}: {'gains kept' if keep else 'old gains restored'}.")
         self._before.clear()
         self._note()
-        if keep:
+        if keep:  # write the parameters of all wheels
             self._designs.update(self._tried)
-            self._write()
+            path = self.folder / f"gains_{next(self._numbers)}.yaml"
+            path.write_text("\n".join(one["yaml"] for one in self._designs.values()), "utf-8")
+            self.state["designed"] = {**self.state["designed"], "name": path.name}
         self._tried.clear()
-
-    def _write(self) -> None:
-        """Write the parameters of all wheels, with the gains that were kept."""
-        path = self.folder / f"gains_{next(self._numbers)}.yaml"
-        path.write_text("\n".join(one["yaml"] for one in self._designs.values()), "utf-8")
-        self.state["designed"] = {**self.state["designed"], "name": path.name}
 
     def _note(self) -> None:
         """Let the guard halt the wheels and restore the old gains if this process dies."""

@@ -157,7 +157,7 @@
     const made = state.designed;
     part("designed").textContent = made ? `${made.name}: ${made.reason}.` : "No design.";
     part("gains").hidden = !made;
-    if (made) { part("gains").href = `results/gains/${made.name}`; part("gains").download = made.name; }
+    if (made) { part("gains").href = `results/${made.name}`; part("gains").download = made.name; }
     part("trial").textContent = state.trial ? `On trial: ${state.trial.wheels.map(label).join(", ")}. Keep the gains, or take them back.` : "";
     part("cannot").textContent = state.drives ? "Drag, or hold the arrow keys; the wheels stop on release." : "No node takes cmd_vel: start skid_steer to drive.";
     enable();

@@ -38,7 +38,10 @@ def test_any_sequence_of_states_reads_back_as_it_was_written(tmp_path_factory, d
     column = st.lists(finite, min_size=n, max_size=n).map(np.array)
     # Any intervals between half and one and a half of each other: no gap, no loss.
     steps = data.draw(st.lists(st.integers(8_000_000, 12_000_000), min_size=n, max_size=n))
-    counts = data.draw(st.lists(st.integers(-(2**62), 2**62), min_size=n, max_size=n))
+    # A counter that stays at an end of its range is full, and refused.
+    ends = {end for k in range(7, 63) for end in (2**k - 1, -(2**k))}
+    count = st.integers(-(2**62), 2**62).filter(lambda c: c not in ends)
+    counts = data.draw(st.lists(count, min_size=n, max_size=n))
     truth = Motion(
         "rear_right",
         START + np.cumsum(np.array(steps, np.int64)),
