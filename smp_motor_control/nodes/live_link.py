@@ -148,8 +148,6 @@ class LiveLink:
         ]
         runtime.steady_timer(node, FRAME_S, self._on_timer)
 
-    # Commands; halt and drive may come from any thread ---------------------------------------
-
     def halt(self, reason: str) -> None:
         """Stop the wheels within a period and refuse commands until they are armed again."""
         self._halt, self.halts = self._halt or reason, self.halts + 1
@@ -175,8 +173,6 @@ class LiveLink:
     def is_body_idle(self) -> bool:
         """Return whether skid_steer, after the last command to the body, yields the wheels."""
         return time.monotonic() - self._body[2] > COMMAND_S + ZERO_S + BODY_TIMEOUT_S
-
-    # The timer -------------------------------------------------------------------------------
 
     def _on_timer(self) -> None:
         now = time.monotonic()

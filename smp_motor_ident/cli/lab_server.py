@@ -1,9 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Serve the page of ``lab``: one page drives, others watch.
-
-A token opens one page; a cookie of that browser and the page's own address are asked for after.
-The page that drives is heard every 0.1 s, or the wheels stop.
-"""
+"""Serve the page of ``lab``: one page drives and is heard every 0.1 s, or the wheels stop."""
 
 import asyncio
 import concurrent.futures
@@ -130,8 +126,6 @@ class Server:
                 link.halt(f"the page was not heard for {LOST_S:g} s")
             link.watched_at = now
 
-    # Access ---------------------------------------------------------------------------------------
-
     def _address(self) -> str:
         host = "127.0.0.1" if self._host in ("0.0.0.0", "::") else self._host
         return f"http://{f'[{host}]' if ':' in host else host}:{self._port}/?token={self._token}"
@@ -173,8 +167,6 @@ class Server:
         ):
             raise web.HTTPForbidden(text="lab: another page may not connect\n")
         return await handler(request)
-
-    # Pages ----------------------------------------------------------------------------------------
 
     async def _page(self, request: web.Request) -> web.Response:
         nonce = secrets.token_urlsafe(16)

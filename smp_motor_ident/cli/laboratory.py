@@ -150,8 +150,6 @@ class Laboratory:
         shown = [*self.state["messages"], [next(self._numbers), kind, text]]
         self.state["messages"] = shown[-MESSAGES:]
 
-    # Events of the link ------------------------------------------------------------------------
-
     def on_frame(self, slots: Array, rows: Array) -> None:
         """Send a batch of samples as rows of float32: slot, then the columns of every wheel."""
         for wheel, model in list(self._models.items()):
@@ -206,8 +204,6 @@ class Laboratory:
             self.send("state", state)
         self._told = now, text
 
-    # What a page asks, in the thread of the server -----------------------------------------------
-
     def ask(self, message: Mapping[str, Any]) -> None:
         """Take a request of the page that drives."""
         jobs: dict[str, tuple[str, Callable[[], None]]] = {
@@ -233,8 +229,6 @@ class Laboratory:
         if self.state["job"]:
             raise ParameterError(f"busy with {self.state['job']}; wait, or stop it")
         self._jobs.put(jobs[wanted])
-
-    # Jobs, in the main thread -------------------------------------------------------------------
 
     def _wait(self, done: Callable[[], bool], moving: bool = False, name: str = "") -> None:
         """Wait while the streams go on; raise if what moves the wheels was stopped."""
@@ -437,10 +431,7 @@ class Prediction:
         self._time = math.nan
 
     def follow(self, time: Array, voltage: Array, speed: Array) -> list[float]:
-        """Return the wheel's speed [rad/s] at instants [s] that end intervals of a voltage [V].
-
-        The first measured ``speed`` is where it begins.
-        """
+        """Return speeds [rad/s] at instants [s] under a voltage [V], from ``speed`` on."""
         speeds = []
         for now, volts, measured in zip(time.tolist(), voltage.tolist(), speed.tolist()):
             if math.isnan(self._time) and math.isfinite(measured):

@@ -11,8 +11,7 @@
   let role = {drives: false, pages: 1};
   let designs = {}, pending = null, waiting = false, counter = 0;
 
-  // The connection, which a worker keeps: drawing does not delay its beats, a page that hangs ends them --
-
+  // The connection, which a worker keeps: drawing does not delay its beats, a page that hangs ends them
   function keepConnection(address, frozen) {
     let socket, heard = 0;
     const open = () => {
@@ -42,8 +41,7 @@
   const halt = () => { if (role.drives && (state.armed || state.job)) ask("stop"); };
   document.addEventListener("visibilitychange", () => { if (document.hidden) halt(); });
 
-  // Samples: one row for each slot of time, the columns of every wheel --------------------------------
-
+  // Samples: one row for each slot of time, the columns of every wheel
   const times = [], values = [];  // values: one array for each wheel and column
   let paused = false, zoomed = null, dirty = false, drawn = 0, cost = 0, told = 0, pointed = null, frames = 0;
 
@@ -135,8 +133,6 @@
     link.click();
   });
 
-  // State and roles ---------------------------------------------------------------------------------
-
   function show(content) {
     const old = state;
     state = content;
@@ -190,8 +186,6 @@
   part("tune").addEventListener("click", () => ask("tune", {accept: part("accept").checked}));
   for (const what of ["apply", "step"]) part(what).addEventListener("click", () => ask(what, {wheel: part("wheel").value}));
 
-  // Tuning --------------------------------------------------------------------------------------------
-
   const figures = {};
   let measured = {};
   function showDesigns(content) {
@@ -240,8 +234,6 @@
   for (const id of ["share", "phase_margin"]) part(id).addEventListener("input", () => request({wheel: part("wheel").value, share: Number(part("share").value), phase_margin: Number(part("phase_margin").value)}));
   for (const id of ["p", "i", "d"]) part(id).addEventListener("input", () => request({wheel: part("wheel").value, ...Object.fromEntries(["p", "i", "d"].map(name => [name, part(name).valueAsNumber]))}));
   part("wheel").addEventListener("change", () => { if (designs[part("wheel").value]) showDesign({...designs[part("wheel").value], asked: null}); });
-
-  // Driving -------------------------------------------------------------------------------------------
 
   const pad = part("pad"), held = new Set();
   let stick = [0, 0], wasDriving = false;  // right and ahead, -1 to 1
