@@ -291,6 +291,12 @@ def test_an_address_of_another_machine_is_told_loudly(process, eventually):
     assert "WARNING: served on 0.0.0.0" in lab.output
 
 
+def test_a_wheel_name_that_holds_html_is_refused(process):
+    lab = process("lab", "--no-browser", "--wheel", "<img src=x onerror=alert(1)>")
+    assert lab.wait(30.0) == 2
+    assert "<img" in lab.output and "Traceback" not in lab.output
+
+
 @pytest.mark.skipif(not CHROMIUM, reason="no Chromium on this machine")
 def test_the_whole_procedure_by_clicks(process, watcher, eventually, tmp_path, ros_domain):
     lab = process("lab", "--demo", "--no-browser", "--domain", str(ros_domain))
