@@ -251,7 +251,11 @@ class Laboratory:
                 self.robot.start_controllers(missing)
             self._stack.enter_context(client.paused(self.robot.wheels))
             self._taken = True
-            self._note()
+            node, name = client.node, get_controller_name(self.robot.wheels[-1])
+            service = node.resolve_service_name(f"{name}/change_state")
+            before = node.count_clients(service)
+            self._note()  # and wait until the controllers know the guard
+            client.until(lambda: node.count_clients(service) > before, steps.TIMEOUT_S)
         if link.halts != halts:
             raise ProcessError("stopped while arming")
         link.watched_at, link.armed = time.monotonic(), True
