@@ -29,8 +29,8 @@ COLUMNS = ("voltage", "current", "speed", "setpoint", "reference", "prediction")
 """Quantities of a wheel: V, A, and the rest in rad/s at the wheel; NaN where there is none."""
 
 SLOT_S = 0.005  # interval of the common time grid; the last sample in it counts
-MAX_LATE_SLOTS = 4  # slots by which one wheel's samples may come after another's
-MAX_OFFSET_SLOTS = 200  # slots by which a stream may lag; more shows a clock that was set
+MAX_LATE_SLOTS = 4  # delay of one wheel's samples after another's [slots]
+MAX_OFFSET_SLOTS = 200  # longest lag of a stream; a longer one shows a clock that was set
 FRAME_S = 1 / 30  # period of batches and of commands
 KEPT_S = 60.0  # length of the kept history
 COMMAND_S = 0.3  # age at which a command ends
@@ -103,7 +103,7 @@ class LiveLink:
 
     The listener has ``on_frame(slots, rows)`` for a batch of samples, shape (slots,) and
     (slots, wheels, columns), ``on_learned(wheel, message)`` for ``MotorParameters``,
-    ``interrupt()`` to end at once what moves them, ``on_halt(reason)`` once the wheels were
+    ``interrupt()`` to end an excitation at once, ``on_halt(reason)`` once the wheels were
     stopped, and ``on_tick()`` for every period.
     """
 

@@ -37,7 +37,7 @@ REPORT_POLICY = "sandbox allow-scripts; frame-ancestors 'self'"  # its scripts r
 
 
 class Page:
-    """One connected page, with what it is to be sent."""
+    """One connected page and its queue of messages."""
 
     def __init__(self, socket: web.WebSocketResponse) -> None:
         self.socket = socket
@@ -45,7 +45,7 @@ class Page:
         self.heard_at = time.monotonic()
 
     async def write(self) -> None:
-        """Send what is queued."""
+        """Send the queued messages."""
         while True:
             message = await self.queue.get()
             if isinstance(message, bytes):
@@ -220,7 +220,7 @@ class Server:
             page.queue.put_nowait(templates.encode(["role", role]))
 
     async def _take(self, page: Page, text: str) -> None:
-        """Do what a page asks; a refusal is answered with its reason."""
+        """Perform the request of a page, or answer with the reason of its refusal."""
         page.heard_at = time.monotonic()
         try:
             await self._do(page, json.loads(text))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Run ``lab``: do what its page asks of a robot, one thing after another.
+"""Run ``lab``: perform the requests of its page on a robot, one after another.
 
 The main thread waits for the robot and works; the server of the page has a thread of its own.
 """
@@ -39,7 +39,7 @@ MOVING = ("arming", "exciting", "trying gains", "stepping")  # jobs that need th
 TRIAL_S = 2.5  # for which gains on trial are watched
 STEP_AT_S, STEP_LASTS_S = 0.3, 1.2  # begin and length of the step of a trial
 STATE_S = 0.1  # shortest time between two messages about the state
-BACKGROUND = -10  # priority of what computes beside the robot
+BACKGROUND = -10  # priority of computations while the robot runs
 MESSAGES = 3  # that a page shows of a kind
 SPAWN = multiprocessing.get_context("spawn")
 COMBINATIONS = ("dc_gain", "time_constant", "time_constant_product", "static_voltage")
@@ -81,7 +81,7 @@ def work(arguments: argparse.Namespace) -> int:
 
 
 class Laboratory:
-    """One robot, what is being done with it, and what its pages show."""
+    """One robot, the job under way, and the state that the pages show."""
 
     def __init__(self, robot: steps.Robot, designs: ProcessPoolExecutor) -> None:
         from smp_motor_control.nodes.live_link import COLUMNS, SLOT_S, LiveLink
@@ -126,7 +126,7 @@ class Laboratory:
                 self._note()
 
     def run(self) -> None:
-        """Do what the pages ask until Ctrl-C."""
+        """Perform the requests of the pages until Ctrl-C."""
         while True:
             interruption.check()
             self.robot.client.until(lambda: not self._jobs.empty(), 0.5)
@@ -231,7 +231,7 @@ class Laboratory:
         self._jobs.put(jobs[wanted])
 
     def _wait(self, done: Callable[[], bool], moving: bool = False, name: str = "") -> None:
-        """Wait while the streams go on; raise if what moves the wheels was stopped."""
+        """Wait while the streams go on; raise if the wheels were stopped meanwhile."""
         while True:
             interruption.check()
             if moving and not self.link.armed:
@@ -437,18 +437,18 @@ class Prediction:
     def follow(self, time: Array, voltage: Array, speed: Array) -> list[float]:
         """Return speeds [rad/s] at instants [s] under a voltage [V], from ``speed`` on."""
         speeds = []
-        for now, volts, measured in zip(time.tolist(), voltage.tolist(), speed.tolist()):
+        for instant, volts, measured in zip(time.tolist(), voltage.tolist(), speed.tolist()):
             if math.isnan(self._time) and math.isfinite(measured):
-                self._motor.speed, self._time = measured * self._ratio, now
-            if math.isfinite(volts) and now > self._time:
-                self._motor.step(volts, min(now - self._time, 1.0))
-                self._time = now
+                self._motor.speed, self._time = measured * self._ratio, instant
+            if math.isfinite(volts) and instant > self._time:
+                self._motor.step(volts, min(instant - self._time, 1.0))
+                self._time = instant
             speeds.append(self._motor.speed / self._ratio)
         return speeds
 
 
 def _shown(estimate: Any) -> dict[str, Any]:
-    """Return what a page shows of an identified motor."""
+    """Return an identified motor in the words of the page."""
     held = {**estimate.combinations, **estimate.parameters}
     grave = [one for one in estimate.findings if one.severity != "note"][:MESSAGES]
     unreliable = any(one.severity in ("unreliable", "refused") for one in grave)

@@ -154,7 +154,7 @@ class Client:
 
 @pytest.fixture
 def two_wheels(process, watcher, eventually, tmp_path):
-    """A robot of two wheels that drives, with its own controllers, and lab beside it."""
+    """A robot of two wheels that drives, with its own controllers, and lab."""
     motors, gains = two_wheeled(tmp_path)
     process("motor_plant", "--ros-args", "-p", f"motors_file:={motors}")
     for wheel in ("left", "right"):
