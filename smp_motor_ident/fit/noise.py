@@ -104,26 +104,34 @@ def _estimate_reflections(residual: Array, runs: Integers, max_order: int) -> tu
     """Return reflection coefficients and the variance of the prediction's error of every order."""
     forward, backward = residual.copy(), residual.copy()
     reflection, variance = np.zeros(max_order), np.zeros(max_order + 1)
-    total, count = 0.0, 0
+    count, total, product, energy = 0, 0.0, 0.0, 0.0
     for r in range(runs.shape[0]):
-        for k in range(runs[r, 0], runs[r, 1]):
+        first, last = runs[r, 0], runs[r, 1]
+        for k in range(first, last):
             total += residual[k] * residual[k]
-            count += 1
+        for k in range(first + 1, last):
+            product += residual[k] * residual[k - 1]
+            energy += residual[k] * residual[k] + residual[k - 1] * residual[k - 1]
+        count += last - first
     variance[0] = total / max(count, 1)
     for m in range(1, max_order + 1):
-        top = bottom = 0.0
-        for r in range(runs.shape[0]):
-            for k in range(runs[r, 0] + m, runs[r, 1]):
-                top += forward[k] * backward[k - 1]
-                bottom += forward[k] * forward[k] + backward[k - 1] * backward[k - 1]
-        c = 2.0 * top / bottom if bottom > 0.0 else 0.0
+        c = 2.0 * product / energy if energy > 0.0 else 0.0
         reflection[m - 1] = c
         variance[m] = variance[m - 1] * max(1.0 - c * c, 1e-15)
+        product = forward_energy = backward_energy = 0.0
         for r in range(runs.shape[0]):
-            for k in range(runs[r, 1] - 1, runs[r, 0] + m - 1, -1):
-                f, b = forward[k], backward[k - 1]
-                forward[k] = f - c * b
-                backward[k] = b - c * f
+            last = runs[r, 1]
+            first = min(runs[r, 0] + m, last)
+            b = backward[first - 1]
+            for k in range(first, last):
+                f, after = forward[k], backward[k]
+                forward[k], backward[k] = f - c * b, b - c * f
+                if k > first:  # pairs of the next order
+                    product += forward[k] * backward[k - 1]
+                    forward_energy += forward[k] * forward[k]
+                    backward_energy += backward[k - 1] * backward[k - 1]
+                b = after
+        energy = forward_energy + backward_energy
     return reflection, variance
 
 
@@ -132,7 +140,7 @@ def _whiten_lines(lines: Array, runs: Integers, predictors: Array, deviation: Ar
     count, n = lines.shape
     order = predictors.shape[1]
     scale = 1.0 / deviation[order]
-    out = np.zeros((count, n))
+    out = np.empty((count, n))
     for j in range(count):
         for r in range(runs.shape[0]):
             first, last = runs[r, 0], runs[r, 1]
@@ -145,8 +153,12 @@ def _whiten_lines(lines: Array, runs: Integers, predictors: Array, deviation: Ar
                 out[j, k] = x / deviation[m]
             for k in range(begun, last):
                 out[j, k] = scale * lines[j, k]
-            for i in range(order):
-                a = scale * predictors[order, i]
+            for i in range(0, order - 1, 2):  # in pairs, which halves the passes
+                a, b = scale * predictors[order, i], scale * predictors[order, i + 1]
                 for k in range(begun, last):
-                    out[j, k] -= a * lines[j, k - 1 - i]
+                    out[j, k] -= a * lines[j, k - 1 - i] + b * lines[j, k - 2 - i]
+            if order % 2:
+                a = scale * predictors[order, order - 1]
+                for k in range(begun, last):
+                    out[j, k] -= a * lines[j, k - order]
     return out

@@ -223,10 +223,12 @@ def compute_gain(data: Data, before: Linear, after: Array) -> float:
         energy = float(new @ new)
         if energy <= 0 or not np.isfinite(energy):
             return -math.inf
+        gain = new.size * math.log(max(float(old @ old), 1e-300) / energy)
         factor = 1.0
-        for lag in range(1, min(40, new.size // 4)):
-            factor += 2 * (float(new[lag:] @ new[:-lag]) / energy) ** 2
-        total += new.size / factor * math.log(max(float(old @ old), 1e-300) / energy)
+        if gain > 0:
+            for lag in range(1, min(40, new.size // 4)):
+                factor += 2 * (float(new[lag:] @ new[:-lag]) / energy) ** 2
+        total += gain / factor
     return total
 
 

@@ -6,7 +6,7 @@ from __future__ import annotations
 import math
 
 from smp_motor_control.arrays import Array
-from smp_motor_ident._compile import compiled, inlined
+from smp_motor_ident._compile import inlined
 from smp_motor_ident.simulate.lanes import (
     CURRENT_LIMIT,
     DECAY,
@@ -36,7 +36,7 @@ def _average_fast_decay(te: float, command: float, emf: float, supply: float) ->
     return mean if command > 0.0 else -mean
 
 
-@compiled
+@inlined
 def terminal_voltage(
     command: float, emf: float, age: float, full_duty: float, lane: Array
 ) -> float:
@@ -47,11 +47,13 @@ def terminal_voltage(
         return out
     if lane[DECAY] > 0.0:
         out = _average_fast_decay(lane[DECAY], out, emf, full_duty)
+    sag, drop, most = lane[SAG], lane[DROP], lane[CURRENT_LIMIT]
+    if sag == 0.0 and drop == 0.0 and most == math.inf:
+        return out
     drive: float = out - emf
-    if lane[SAG] != 0.0:
+    if sag != 0.0:
         duty = command / full_duty
-        drive /= 1.0 + lane[SAG] * duty * duty
-    drop, most = lane[DROP], lane[CURRENT_LIMIT]
+        drive /= 1.0 + sag * duty * duty
     drive -= min(max(drive, -drop), drop)
     out = emf + min(max(drive, -most), most)
     return out

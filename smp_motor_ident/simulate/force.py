@@ -6,7 +6,7 @@ from __future__ import annotations
 import math
 
 from smp_motor_control.arrays import Array
-from smp_motor_ident._compile import compiled
+from smp_motor_ident._compile import inlined
 from smp_motor_ident.simulate.lanes import (
     DRAG,
     LOAD_STEP,
@@ -18,10 +18,12 @@ from smp_motor_ident.simulate.lanes import (
 LOAD_ONSET_SHARE = 0.01  # of the record, within which a load sets in
 
 
-@compiled
+@inlined
 def extra_force(w: float, dry: float, age: float, lane: Array) -> float:
     """Return the force [V] on a lane besides its Coulomb friction ``dry`` and constant load."""
-    f: float = lane[DRAG] * w * abs(w)
+    f = 0.0
+    if lane[DRAG] != 0.0:
+        f = lane[DRAG] * w * abs(w)
     if lane[STRIBECK] != 0.0:
         r = w / lane[STRIBECK_SPEED]
         f += dry * lane[STRIBECK] * math.exp(-r * r)

@@ -96,10 +96,10 @@ def transitions(lengths: Array, lanes: Array) -> Array:
 def _find_zero_crossing(
     q: float, w: float, h: float, v: float, f: float, direction: float,
     te: float, tm: float, k: float, be: float,
-) -> float:  # fmt: skip
-    """Return when within ``h`` the speed first crosses zero, or -1."""
-    q1, w1, _ = _propagate(q, w, h, v, f, te, tm, k, be)
-    low, high = 0.0, h
+) -> tuple[float, float, float, float]:  # fmt: skip
+    """Return when within ``h`` the speed first crosses zero, or ``h``, and q, w and th then."""
+    q1, w1, th1 = _propagate(q, w, h, v, f, te, tm, k, be)
+    low, high, w_high = 0.0, h, w1
     if w1 * direction >= 0.0:
         # It may dip through zero and come back: then its slope changes sign inside.
         before, after = (q if te > 0.0 else v - k * w) - be * w - f, q1 - be * w1 - f
@@ -107,35 +107,35 @@ def _find_zero_crossing(
             not (before * direction < -1e-12 * (abs(v) + abs(f)) and after * direction > 0.0)
             or te == 0.0
         ):
-            return -1.0
+            return h, q1, w1, th1
         for _ in range(60):
             middle = 0.5 * (low + high)
             qm, wm, _ = _propagate(q, w, middle, v, f, te, tm, k, be)
             if wm * direction < 0.0:
-                high = middle
+                high, w_high = middle, wm
                 break
             if (qm - be * wm - f) * direction < 0.0:
                 low = middle
             else:
                 high = middle
             if high - low < 1e-9 * h:
-                return -1.0
+                return h, q1, w1, th1
         low = 0.0
     # Safeguarded Newton between a time before and one after the crossing.
-    t = 0.5 * (low + high)
+    t = high * w / (w - w_high) if w * direction > 0.0 else 0.5 * high
     for _ in range(80):
-        qm, wm, _ = _propagate(q, w, t, v, f, te, tm, k, be)
-        if wm * direction < 0.0:
+        q1, w1, th1 = _propagate(q, w, t, v, f, te, tm, k, be)
+        if w1 * direction < 0.0:
             high = t
         else:
             low = t
-        if abs(wm) <= 1e-14 * abs(w) or high - low <= 1e-15 * h:
+        if abs(w1) <= 1e-14 * abs(w) or high - low <= 1e-15 * h:
             break
-        slope = (qm - be * wm - f) / tm
-        t = t - wm / slope if slope * direction < 0.0 else low
+        slope = (q1 - be * w1 - f) / tm
+        t = t - w1 / slope if slope * direction < 0.0 else low
         if not low < t < high:
             t = 0.5 * (low + high)
-    return t
+    return t, q1, 0.0, th1
 
 
 @compiled
@@ -167,13 +167,10 @@ def _advance(
                 q = v + (q - v) * math.exp(-wait / te)
             left -= wait
         f = load + (plus if direction > 0.0 else -minus)
-        t = _find_zero_crossing(q, w, left, v, f, direction, te, tm, k, be)
-        span = left if t < 0.0 else t
-        q, w, turned = _propagate(q, w, span, v, f, te, tm, k, be)
+        t, q, w, turned = _find_zero_crossing(q, w, left, v, f, direction, te, tm, k, be)
         th += turned
-        if t < 0.0:
+        if t == left:
             break
-        w = 0.0
         net = (q if te > 0.0 else v) - load
         direction = 1.0 if net > plus * hold else -1.0 if net < -minus * hold else STUCK_DIRECTION
         left -= t
@@ -185,6 +182,7 @@ def _advance(
 @compiled
 def simulate_rows(  # noqa: C901 - one pass, kept whole so that nothing is stored between its steps
     first_piece: Integers,
+    row: Integers,
     length: Array,
     edges: Integers,
     group: Integers,
@@ -210,9 +208,9 @@ def simulate_rows(  # noqa: C901 - one pass, kept whole so that nothing is store
     ----------
     first_piece : ndarray of int, shape (n + 1,)
         First piece of every row; the last entry is the number of pieces.
-    length, edges, group, section : ndarray, shape (pieces,)
-        Of every piece: its length [s]; by how many shifts a lane's own is longer; its transition in
-        ``tables`` or -1; its column of ``command``.
+    row, length, edges, group, section : ndarray, shape (pieces,)
+        Of every piece: its row; its length [s]; by how many shifts a lane's own is longer; its
+        transition in ``tables`` or -1; its column of ``command``.
     command : ndarray, shape (lanes or 1, sections)
         Voltage [V] of every section.
     tables, halves : ndarray, shape (lanes, groups, 12)
@@ -232,7 +230,7 @@ def simulate_rows(  # noqa: C901 - one pass, kept whole so that nothing is store
     age : ndarray, shape (pieces or 0,)
         Share of the record that has passed at every piece, for parameters that drift.
     out, volts : ndarray, shape (3, lanes, n) and (lanes, n or 0)
-        Filled: q, w, th at every row; mean terminal voltage over the row.
+        Filled: q, w, th at every row.  Added to: integral of the terminal voltage [V s].
     """
     for b in range(lanes.shape[1]):
         lane = lanes[:, b].copy()
@@ -242,63 +240,90 @@ def simulate_rows(  # noqa: C901 - one pass, kept whole so that nothing is store
         for g in range(segment.shape[0] - 1):
             q, w = initial[g, 0] + own[0, b], initial[g, 1] + own[1, b]
             th, load = initial[g, 2] + own[2, b], lane[LOAD] + initial[g, 3] + own[3, b]
-            direction, v = _sign(w), 0.0
-            for row in range(segment[g], segment[g + 1]):
-                put = gathered = 0.0
-                for j in range(first_piece[row], first_piece[row + 1]):
-                    h = length[j] + edges[j] * shift[b]
-                    if h <= 0.0:
-                        continue
-                    v, force = voltage[section[j]], load
+            direction = _sign(w)
+            j, end = first_piece[segment[g]], first_piece[segment[g + 1]]
+            while j < end:
+                moving = not friction or direction != STUCK_DIRECTION
+                dry = plus if direction > 0.0 else -minus if direction < 0.0 else 0.0
+                if moving and not feedback and group[j] >= 0:
+                    j, q, w, th = _advance_tabulated(
+                        j, end, q, w, th, load + dry, direction if friction else STUCK_DIRECTION,
+                        tm, be, te > 0.0, group, section, row, length, edges, shift[b], voltage,
+                        tables[b], out[:, b], volts[b],
+                    )  # fmt: skip
+                    if j == end:
+                        break
+                h = length[j] + edges[j] * shift[b]
+                u, force, kind = voltage[section[j]], load, group[j]
+                v = u
+                if h > 0.0:
                     if age.shape[0] > 0:
                         passed = age[j]
                         scale = 1.0 + lane[FRICTION_DRIFT] * passed
                         plus, minus = lane[VC_PLUS] * scale, lane[VC_MINUS] * scale
-                    dry = plus if direction > 0.0 else -minus if direction < 0.0 else 0.0
-                    kind = group[j]
+                        dry = plus if direction > 0.0 else -minus if direction < 0.0 else 0.0
                     if feedback:
-                        u = v
                         v = terminal_voltage(u, k * w, passed, full_duty, lane)
                         force = load + extra_force(w, dry, passed, lane)
-                        if direction != STUCK_DIRECTION or not friction:
-                            f = force + dry
-                            if kind >= 0:
-                                middle = _apply_transition(halves, b, kind, 4, q, w, v, f)
-                            else:
-                                _, middle, _ = _propagate(q, w, 0.5 * h, v, f, te, tm, k, be)
+                        if moving:
+                            _, middle, _ = _advance_piece(
+                                halves[b], kind, q, w, 0.5 * h, v, force + dry, te, tm, k, be
+                            )
                             if friction and middle * direction < 0.0:
                                 middle = 0.0
                             v = terminal_voltage(u, k * middle, passed, full_duty, lane)
                             force = load + extra_force(middle, dry, passed, lane)
-                    put += h * v
-                    gathered += h
-                    if friction and direction == STUCK_DIRECTION:
-                        q, w, th, direction = _advance(
-                            q, w, th, direction, h, v, force, plus, minus, hold, te, tm, k, be
+                    if moving:
+                        f = force + dry
+                        q1, w1, turned = _advance_piece(
+                            tables[b], kind, q, w, h, v, f, te, tm, k, be
                         )
-                        continue
-                    f = force + dry
-                    if kind >= 0:
-                        q1 = _apply_transition(tables, b, kind, 0, q, w, v, f)
-                        w1 = _apply_transition(tables, b, kind, 4, q, w, v, f)
-                        th1 = th + _apply_transition(tables, b, kind, 8, q, w, v, f)
+                        # A dip through zero needs a speed that the first slope uses up.
+                        moving = not friction or not (
+                            w1 * direction <= 0.0
+                            or (te > 0.0 and (tm * w + h * (q - be * w - f)) * direction <= 0.0)
+                        )
+                    if moving:
+                        q, w, th = q1, w1, th + turned
                     else:
-                        q1, w1, turned = _propagate(q, w, h, v, f, te, tm, k, be)
-                        th1 = th + turned
-                    # A dip through zero needs a speed that the first slope uses up.
-                    if friction and (
-                        w1 * direction <= 0.0
-                        or (te > 0.0 and (tm * w + h * (q - be * w - f)) * direction <= 0.0)
-                    ):
                         q, w, th, direction = _advance(
                             q, w, th, direction, h, v, force, plus, minus, hold, te, tm, k, be
                         )
-                        continue
-                    q, w, th = q1, w1, th1
-                out[0, b, row] = q if te > 0.0 else v - k * w
-                out[1, b, row], out[2, b, row] = w, th
-                if volts.shape[1] > 0:
-                    volts[b, row] = put / gathered if gathered > 0.0 else 0.0
+                    if volts.shape[1] > 0:
+                        volts[b, row[j]] += h * v
+                out[0, b, row[j]] = q if te > 0.0 else v - k * w
+                out[1, b, row[j]], out[2, b, row[j]] = w, th
+                j += 1
+
+
+@compiled
+def _advance_tabulated(
+    j: int, end: int, q: float, w: float, th: float, f: float, direction: float, tm: float,
+    be: float, has_lag: bool, group: Integers, section: Integers, row: Integers, length: Array,
+    edges: Integers, shift: float, voltage: Array, tables: Array, out: Array, volts: Array,
+) -> tuple[int, float, float, float]:  # fmt: skip
+    """Advance through pieces whose transitions are tabulated, up to an event of friction.
+
+    Return the next piece, q, w and th.
+    """
+    for i in range(j, end):
+        kind = group[i]
+        if kind < 0:
+            return i, q, w, th
+        h = length[i] + edges[i] * shift
+        if h > 0.0:
+            v = voltage[section[i]]
+            q1, w1, turned = _apply_transition(tables, kind, q, w, v, f)
+            if direction != STUCK_DIRECTION and (
+                w1 * direction <= 0.0
+                or (has_lag and (tm * w + h * (q - be * w - f)) * direction <= 0.0)
+            ):
+                return i, q, w, th
+            q, w, th = q1, w1, th + turned
+            if volts.shape[0] > 0:
+                volts[row[i]] += h * v
+        out[0, row[i]], out[1, row[i]], out[2, row[i]] = q, w, th
+    return end, q, w, th
 
 
 @inlined
@@ -307,10 +332,23 @@ def _sign(w: float) -> float:
 
 
 @inlined
+def _advance_piece(
+    table: Array, kind: int, q: float, w: float, h: float, v: float, f: float,
+    te: float, tm: float, k: float, be: float,
+) -> tuple[float, float, float]:  # fmt: skip
+    """Return q, w and the change of th after a piece, by its transition where it is tabulated."""
+    if kind < 0:
+        return _propagate(q, w, h, v, f, te, tm, k, be)
+    return _apply_transition(table, kind, q, w, v, f)
+
+
+@inlined
 def _apply_transition(
-    tables: Array, b: int, kind: int, at: int, q: float, w: float, v: float, f: float
-) -> float:
-    """Return one output of a tabulated transition."""
-    moved: float = tables[b, kind, at] * q + tables[b, kind, at + 1] * w
-    moved += tables[b, kind, at + 2] * v + tables[b, kind, at + 3] * f
-    return moved
+    table: Array, kind: int, q: float, w: float, v: float, f: float
+) -> tuple[float, float, float]:
+    """Return q, w and the change of th by a tabulated transition."""
+    t = table[kind]
+    q1: float = t[0] * q + t[1] * w + t[2] * v + t[3] * f
+    w1: float = t[4] * q + t[5] * w + t[6] * v + t[7] * f
+    turned: float = t[8] * q + t[9] * w + t[10] * v + t[11] * f
+    return q1, w1, turned

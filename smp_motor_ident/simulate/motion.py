@@ -12,10 +12,10 @@ from smp_motor_ident.simulate import lanes as at
 from smp_motor_ident.simulate.kernel import simulate_rows, transitions
 from smp_motor_ident.simulate.rows import Pieces, Rows
 
-FEEDBACK_PARAMETERS = (
+FEEDBACK_PARAMETERS = [
     at.SAG, at.DROP, at.CURRENT_LIMIT, at.DECAY, at.FREE, at.DECLINE, at.DRAG, at.STRIBECK,
     at.FRICTION_DRIFT, at.LOAD_STEP,
-)  # fmt: skip
+]  # fmt: skip
 """Parameters for which the voltage or a force follows the motion."""
 
 
@@ -32,7 +32,8 @@ class Motion:
 
 def follows_motion(lanes: Array) -> bool:
     """Tell whether any lane's voltage or force follows the motion."""
-    return any((lanes[k] != at.NEUTRAL[k]).any() for k in FEEDBACK_PARAMETERS)
+    neutral = at.NEUTRAL[FEEDBACK_PARAMETERS, None]
+    return bool((lanes[FEEDBACK_PARAMETERS] != neutral).any())
 
 
 def simulate(
@@ -82,11 +83,11 @@ def simulate(
     friction = bool((lanes[[at.VC_PLUS, at.VC_MINUS]] != 0).any())
     age: Array = np.zeros(0)
     if (lanes[[at.DECLINE, at.FRICTION_DRIFT, at.LOAD_STEP]] != 0).any():
-        age = np.repeat(rows.age, np.diff(pieces.first))
+        age = rows.age[pieces.row]
     out = np.empty((3, count, len(rows)))
     volts = np.zeros((count, len(rows) if charge else 0))
     simulate_rows(
-        pieces.first, pieces.length, pieces.edges, pieces.group, pieces.section,
+        pieces.first, pieces.row, pieces.length, pieces.edges, pieces.group, pieces.section,
         np.ascontiguousarray(command.T), tables, halves, np.ascontiguousarray(lanes), moved,
         rows.segment, initial, added, friction, feedback, full_duty, age, out, volts,
     )  # fmt: skip
@@ -94,7 +95,7 @@ def simulate(
     gathered: Array = volts
     if charge:
         first = np.repeat(rows.segment[:-1], np.diff(rows.segment))
-        put = np.cumsum(volts * rows.interval, axis=1)
+        put = np.cumsum(volts, axis=1)
         gathered = put - put[:, first] - lanes[at.TE, :, None] * (drive - drive[:, first])
         gathered -= lanes[at.K, :, None] * (angle - angle[:, first])
     last = np.maximum(pieces.first[1:] - 1, 0)

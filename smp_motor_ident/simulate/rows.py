@@ -23,6 +23,7 @@ class Pieces:
     first: Integers  # shape (n + 1,)
     length: Array
     edges: Integers
+    row: Integers
     group: Integers
     section: Integers
     grouped: Array  # shape (groups,): length of each group [s]
@@ -91,7 +92,7 @@ class Rows:
     def _pieces(self, delay: float, longest: float, moving: bool) -> Pieces:
         n = len(self)
         cut = not self.plain or delay != 0.0 or moving
-        section, length, edges, count = self._cut(delay) if cut else self._uncut()
+        section, length, edges, count = self._cut(delay, moving) if cut else self._uncut()
         if np.isfinite(longest):
             parts = np.maximum(np.ceil(length / longest - LENGTH_TOLERANCE), 1).astype(np.int64)
             if parts.max() > 1:
@@ -103,22 +104,23 @@ class Rows:
                 section, length = np.repeat(section, parts), np.repeat(length / parts, parts)
                 count = np.bincount(row, minlength=n)
         first = np.concatenate([[0], np.cumsum(count)])
-        group, grouped, grouped_edges = _group_pieces(length, edges, self.step)
-        return Pieces(first, length, edges, group, section, grouped, grouped_edges)
+        group, of = _group_pieces(length, edges, 10 * LENGTH_TOLERANCE * self.step)
+        row = np.repeat(np.arange(n), count)
+        return Pieces(first, length, edges, row, group, section, length[of], edges[of])
 
     def _uncut(self) -> tuple[Integers, Array, Integers, Integers]:
         """Return what `_cut` does where every row is one section."""
         n = len(self)
         return np.arange(n), self.interval, np.zeros(n, np.int64), np.ones(n, np.int64)
 
-    def _cut(self, delay: float) -> tuple[Integers, Array, Integers, Integers]:
+    def _cut(self, delay: float, moving: bool) -> tuple[Integers, Array, Integers, Integers]:
         """Return section, length and edges of every piece, and the pieces of every row."""
         most = len(self) + self.begin.size
         section, length = np.empty(most, dtype=np.int64), np.empty(most)
         edges, count = np.empty(most, dtype=np.int64), np.empty(len(self), dtype=np.int64)
         pieces = _cut_rows(
-            self.time, self.interval, self.segment, self.begin, self.section, delay, section,
-            length, edges, count,
+            self.time, self.interval, self.segment, self.begin, self.section, delay, moving,
+            section, length, edges, count,
         )  # fmt: skip
         return section[:pieces], length[:pieces], edges[:pieces], count
 
@@ -126,7 +128,8 @@ class Rows:
 @compiled
 def _cut_rows(
     time: Array, interval: Array, segment: Integers, begin: Array, first_section: Integers,
-    delay: float, section: Integers, length: Array, edges: Integers, count: Integers,
+    delay: float, moving: bool, section: Integers, length: Array, edges: Integers,
+    count: Integers,
 ) -> int:  # fmt: skip
     """Fill in section, length and edges of every piece, and the pieces of every row."""
     made = 0
@@ -135,7 +138,8 @@ def _cut_rows(
         for row in range(segment[g], segment[g + 1]):
             gone = time[row] - interval[row]
             slack = LENGTH_TOLERANCE * interval[row]  # a switch at a row belongs to the next
-            while at + 1 < first_section[g + 1] and begin[at + 1] + delay < gone - slack:
+            begun = gone - slack if moving else gone + slack  # a later one delays it into the row
+            while at + 1 < first_section[g + 1] and begin[at + 1] + delay < begun:
                 at += 1
             before = made
             while (
@@ -154,21 +158,21 @@ def _cut_rows(
     return made
 
 
-def _group_pieces(length: Array, edges: Integers, step: float) -> tuple[Integers, Array, Integers]:
-    """Return the group of every piece and the length and edges of each; none where all differ."""
-    low, high = float(length.min()), float(length.max())
-    if high - low <= LENGTH_TOLERANCE * step and not edges.any():
-        return np.zeros(length.size, dtype=np.int64), np.array([length[0]]), np.zeros(1, np.int64)
-    kind = np.round(length / (LENGTH_TOLERANCE * 10 * step)).astype(np.int64) * 4 + edges + 1
-    _, seen = np.unique(kind[:: max(length.size // 2000, 1)], return_counts=True)
-    if np.sort(seen)[-MAX_LENGTH_GROUPS:].sum() < 0.5 * seen.sum():
-        return np.full(length.size, -1), np.zeros(0), np.zeros(0, dtype=np.int64)
-    kinds, index, group, count = np.unique(
-        kind, return_index=True, return_inverse=True, return_counts=True
-    )
-    if kinds.size <= MAX_LENGTH_GROUPS:
-        return group.astype(np.int64), length[index], edges[index]
-    often = np.sort(np.argsort(-count, kind="stable")[:MAX_LENGTH_GROUPS])
-    place = np.full(kinds.size, -1)
-    place[often] = np.arange(often.size)
-    return place[group], length[index[often]], edges[index[often]]
+@compiled
+def _group_pieces(length: Array, edges: Integers, quantum: float) -> tuple[Integers, Integers]:
+    """Return the group of every piece, -1 for none, and the first piece of every group."""
+    group = np.full(length.size, -1)
+    kinds, first = np.empty(MAX_LENGTH_GROUPS), np.empty(MAX_LENGTH_GROUPS, dtype=np.int64)
+    made = 0
+    for j in range(length.size):
+        kind = 4.0 * np.rint(length[j] / quantum) + edges[j]
+        g = 0
+        while g < made and kinds[g] != kind:
+            g += 1
+        if g == MAX_LENGTH_GROUPS:
+            continue
+        if g == made:
+            kinds[g], first[g] = kind, j
+            made += 1
+        group[j] = g
+    return group, first[:made]
