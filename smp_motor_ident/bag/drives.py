@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Test whether one signal drives another, to find a voltage and its motion among fields."""
 
-from itertools import product
 from statistics import NormalDist
 
 import numpy as np
@@ -139,13 +138,13 @@ def _residual_share(u: Array, y: Array, shift: int, lag: float) -> float:
     every = max(y.size // MAX_FIT_ROWS, 1)
     some = y[::every]
     best = np.inf
-    for trial, second in product(lag * np.geomspace(0.4, 2.5, 25), SECOND_LAG_ROWS):
-        columns = (apply_lag(u, trial), apply_lag(np.sign(y), trial), np.ones(y.size))
-        columns = (apply_lag(columns[0], second), *columns[1:])
-        matrix = np.stack(columns)[:, ::every]
-        both = matrix @ some
-        multiples = np.linalg.lstsq(matrix @ matrix.T, both, rcond=None)[0]
-        best = min(best, float(some @ some - both @ multiples))
+    for trial in lag * np.geomspace(0.4, 2.5, 25):
+        driven, friction = apply_lag(u, trial), apply_lag(np.sign(y), trial)
+        for second in SECOND_LAG_ROWS:
+            matrix = np.stack([apply_lag(driven, second), friction, np.ones(y.size)])[:, ::every]
+            both = matrix @ some
+            multiples = np.linalg.lstsq(matrix @ matrix.T, both, rcond=None)[0]
+            best = min(best, float(some @ some - both @ multiples))
     return best / float(np.sum((some - some.mean()) ** 2))
 
 
