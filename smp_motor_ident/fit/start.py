@@ -58,10 +58,16 @@ def guess_motors(data: Data, best: int = 3, component: Component | None = None) 
 
 
 def _are_near(one: Chain, other: Chain) -> bool:
-    """Tell whether fits from two motors would end at the same minimum."""
-    names = ("ln_a0", "ln_a1")
-    near = all(abs(one.values[n] - other.values[n]) < MIN_LOG_DISTANCE for n in names)
-    return near and one.values.get("delay") == other.values.get("delay")
+    """Tell whether fits from two motors would end at the same minimum.
+
+    Of the lag behind a long delay only their sum shows.
+    """
+    delay = one.values.get("delay", 0.0)
+    if delay != other.values.get("delay", 0.0):
+        return False
+    gain = abs(one.values["ln_a0"] - other.values["ln_a0"])
+    lags = [delay + math.exp(c.values["ln_a1"] - c.values["ln_a0"]) for c in (one, other)]
+    return max(gain, abs(math.log(lags[0] / lags[1]))) < MIN_LOG_DISTANCE
 
 
 def select_views(data: Data) -> Iterator[Data]:
