@@ -3,7 +3,8 @@
 
 A node's ``main`` is ``partial(run, "name", TheNode)``.  :func:`run` calls the node's ``on_stop()``,
 if defined, before it destroys the node for any reason: SIGINT, SIGTERM, SIGQUIT, SIGHUP (a closed
-terminal), :func:`finish`, or an exception in a callback.
+terminal), SIGTSTP (Ctrl-Z: a suspended node cannot stop its wheels), :func:`finish`, or an
+exception in a callback.
 """
 
 import os
@@ -49,7 +50,11 @@ LATCHED = QoSProfile(
 )
 """Descriptions; late subscribers get the last one."""
 
-_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGQUIT, signal.SIGHUP)
+_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGQUIT, signal.SIGHUP, signal.SIGTSTP)
+
+
+def _wake_only(*_: object) -> None:
+    """Do nothing: :meth:`_Stop._read_signals` handles the signal."""
 
 
 class _Stop:
@@ -77,14 +82,14 @@ class _Stop:
         for number in _SIGNALS:
             # nohup ignores SIGHUP.
             if number != signal.SIGHUP or signal.getsignal(number) is not signal.SIG_IGN:
-                signal.signal(number, lambda *_: None)
+                signal.signal(number, _wake_only)
         signal.set_wakeup_fd(outlet, warn_on_full_buffer=False)
         threading.Thread(target=self._read_signals, args=(inlet,), daemon=True).start()
 
     def _read_signals(self, inlet: int) -> None:
         asked = False
         while number := os.read(inlet, 1):
-            if number[0] not in _SIGNALS:  # such as SIGCONT, handled by a node
+            if signal.getsignal(number[0]) is not _wake_only:  # the node has its own handler
                 continue
             # A second signal exits at once, except SIGHUP, which a closing terminal sends twice.
             if asked and number[0] != signal.SIGHUP:

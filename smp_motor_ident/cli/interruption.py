@@ -5,6 +5,7 @@ Python drops an exception that a signal handler raises inside some callbacks, am
 around a fork; a tool that is just starting a process would then go on as if nobody had asked.
 """
 
+import os
 import signal
 import threading
 from collections.abc import Iterator
@@ -17,9 +18,9 @@ _held = threading.Event()
 
 
 @contextmanager
-def interruptible() -> Iterator[None]:
-    """Let SIGINT, SIGTERM and SIGHUP interrupt what runs in the block."""
-    previous = {number: signal.signal(number, _interrupt) for number in _SIGNALS}
+def interruptible(*more: signal.Signals) -> Iterator[None]:
+    """Let SIGINT, SIGTERM, SIGHUP and ``more`` signals interrupt the block."""
+    previous = {number: signal.signal(number, _interrupt) for number in (*_SIGNALS, *more)}
     try:
         yield
     finally:
@@ -47,6 +48,8 @@ def held() -> Iterator[None]:
 
 
 def _interrupt(number: int, frame: FrameType | None) -> None:
+    if number == signal.SIGTSTP:
+        os.killpg(0, signal.SIGCONT)  # Ctrl-Z suspends this tool's helper processes
     _requested.set()
     if not _held.is_set():
         raise KeyboardInterrupt

@@ -10,7 +10,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import IO, Any
 
@@ -26,8 +26,12 @@ class ProcessError(SmpError):
     exit_code = 1
 
 
-def connect(name: str, ros_arguments: Sequence[str] = ()) -> Any:
-    """Return the client of a running robot, for a ``with`` block; imports ROS only now."""
+@contextlib.contextmanager
+def connect(name: str, ros_arguments: Sequence[str] = ()) -> Iterator[Any]:
+    """Yield the client of a running robot; ROS is imported only now.
+
+    Ctrl-Z interrupts the block like Ctrl-C: a suspended tool could not stop the wheels.
+    """
     if wrong := find_domain_problem():
         raise ParameterError(wrong)
     try:
@@ -37,7 +41,8 @@ def connect(name: str, ros_arguments: Sequence[str] = ()) -> Any:
             f"a running robot needs ROS, and {error.name or error} is missing; source the "
             "workspace, or setup.bash of the repository"
         ) from None
-    return RobotClient(ros_arguments, name)
+    with interruption.interruptible(signal.SIGTSTP), RobotClient(ros_arguments, name) as client:
+        yield client
 
 
 def free_domain(first: int = 215, last: int = 232) -> int:
@@ -94,7 +99,8 @@ class Processes:
 
     def __exit__(self, *_: object) -> None:
         """Stop all; a second Ctrl-C meanwhile does not keep any alive."""
-        kept = {s: signal.signal(s, signal.SIG_IGN) for s in (signal.SIGINT, signal.SIGTERM)}
+        ignored = (signal.SIGINT, signal.SIGTERM, signal.SIGTSTP)
+        kept = {s: signal.signal(s, signal.SIG_IGN) for s in ignored}
         try:
             self.stop(*self._running)
         finally:

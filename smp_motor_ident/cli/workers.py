@@ -57,6 +57,8 @@ def _do(name: str) -> Any:
 def end_with_parent() -> None:
     """Leave Ctrl-C to the parent, and end when it does, however that ends."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    if signal.getsignal(signal.SIGTSTP) is not signal.SIG_DFL:  # as Ctrl-C, see `connect`
+        signal.signal(signal.SIGTSTP, signal.SIG_IGN)
     for number in (signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, signal.SIG_DFL)
     die_with_parent(signal.SIGKILL)

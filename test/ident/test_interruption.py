@@ -5,6 +5,8 @@ import argparse
 import contextlib
 import os
 import signal
+import subprocess
+import sys
 import weakref
 from functools import partial
 
@@ -77,3 +79,34 @@ def test_an_error_behind_an_interruption_that_was_dropped_is_that_interruption(c
 
     assert frame.run(partial(argparse.ArgumentParser, "tool"), compiles, []) == 130
     assert capsys.readouterr().err == "tool: interrupted\n"
+
+
+def test_ctrl_z_interrupts_only_a_tool_that_is_connected_to_a_robot():
+    with interruption.interruptible():
+        assert signal.getsignal(signal.SIGTSTP) is signal.SIG_DFL
+        with pytest.raises(KeyboardInterrupt), interruption.interruptible(signal.SIGTSTP):
+            os.kill(os.getpid(), signal.SIGTSTP)
+        assert signal.getsignal(signal.SIGTSTP) is signal.SIG_DFL
+        with pytest.raises(KeyboardInterrupt):
+            interruption.check()
+
+
+def test_ctrl_z_leaves_no_helper_process_suspended():
+    program = """
+import os, signal, subprocess, time
+from smp_motor_ident.cli import interruption
+
+helper = subprocess.Popen(["sleep", "0.5"])
+try:
+    with interruption.interruptible(signal.SIGTSTP):
+        os.killpg(0, signal.SIGTSTP)
+        time.sleep(60.0)
+except KeyboardInterrupt:
+    helper.wait()
+    print("both ended")
+"""
+    command = [sys.executable, "-c", program]
+    done = subprocess.run(
+        command, preexec_fn=os.setpgrp, timeout=60.0, capture_output=True, check=True
+    )
+    assert done.stdout == b"both ended\n"

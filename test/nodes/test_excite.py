@@ -22,11 +22,11 @@ def test_excite_is_bounded_ends_by_itself_and_ends_at_zero(process, robot, event
     assert one[20:60] != two[20:60]
     assert not robot.commands["front_right"]
 
-    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT):
+    for name in ("SIGINT", "SIGTERM", "SIGHUP", "SIGQUIT", "SIGTSTP"):
         robot.commands["front_left"].clear()
         excite = process("excite", "--ros-args", "-p", "signal:=square", "-p", "duration:=60.0")
         eventually(lambda: len(robot.commands["front_left"]) > 20, 20.0, robot.spin)
-        excite.send_signal(number)
+        excite.send_signal(getattr(signal, name))
         assert excite.wait(2.0) == 0
         last = robot.commands["front_left"]
         eventually(lambda c=last: c[-1].voltage == 0.0, 3.0, robot.spin, "no zero command")

@@ -274,7 +274,7 @@ def test_settings_change_as_a_whole_or_not_at_all(context):
     node.destroy_node()
 
 
-@pytest.mark.parametrize("number", ["SIGINT", "SIGTERM", "SIGQUIT", "SIGHUP"])
+@pytest.mark.parametrize("number", ["SIGINT", "SIGTERM", "SIGQUIT", "SIGHUP", "SIGTSTP"])
 def test_signal_ends_a_node_cleanly_within_two_seconds(process, eventually, number):
     node = process(sys.executable, "-c", PROGRAM.format(work="pass"))
     eventually(lambda: "ready" in node.output, 20.0)

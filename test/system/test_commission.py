@@ -99,7 +99,10 @@ def test_two_robots_on_one_topic_are_named_before_anything_moves(
     assert not (tmp_path / "r").exists()
 
 
-def test_a_killed_commission_leaves_the_controllers_as_they_were(process, robot, eventually):
+@pytest.mark.parametrize("name", ["SIGKILL", "SIGTSTP"])
+def test_a_killed_or_suspended_commission_restores_the_controllers(
+    process, robot, eventually, name
+):
     process("motor_plant")
     gains = ("-p", "p:=2.0", "-p", "i:=40.0")
     process("wheel_pid", "--ros-args", "-r", "__ns:=/rear_left", *gains)
@@ -108,7 +111,7 @@ def test_a_killed_commission_leaves_the_controllers_as_they_were(process, robot,
     eventually(
         lambda: abs(robot.states["rear_left"][-1].voltage) > 1.0, 60.0, robot.spin, tool.output
     )
-    tool.send_signal(signal.SIGKILL)
+    tool.send_signal(getattr(signal, name))
 
     def follows() -> bool:
         robot.send_setpoint(1.0)
