@@ -78,10 +78,11 @@ class Server:
         ready.result()
         self._laboratory.send = self._send
         if not _is_loopback(self._host):
-            text = (
-                "who has the address below, with this machine's for 127.0.0.1, can drive the robot"
+            print(
+                f"WARNING: served on {self._host}, not encrypted: whoever has the address below, "
+                "with this machine's network address in it, can drive the robot",
+                flush=True,
             )
-            print(f"WARNING: served on {self._host}, not encrypted: {text}", flush=True)
         self._invite()
         if self._browse and (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
             webbrowser.open(self._address())
@@ -127,7 +128,7 @@ class Server:
             link.watched_at = now
 
     def _address(self) -> str:
-        host = "127.0.0.1" if self._host in ("0.0.0.0", "::") else self._host
+        host = {"0.0.0.0": "127.0.0.1", "::": "::1"}.get(self._host, self._host)
         return f"http://{f'[{host}]' if ':' in host else host}:{self._port}/?token={self._token}"
 
     def _invite(self) -> None:

@@ -172,7 +172,12 @@ CUTS = ("stop", "closed", "silent", "second page", "killed")
 
 @pytest.mark.parametrize(
     ("moved", "cut"),
-    [*(("by the joystick", cut) for cut in CUTS), ("excited", "closed"), ("excited", "killed")],
+    [
+        *(("by the joystick", cut) for cut in CUTS),
+        ("excited", "closed"),
+        ("excited", "killed"),
+        ("excited", "suspended"),
+    ],
 )
 def test_the_wheels_stand_half_a_second_after(two_wheels, eventually, moved, cut):
     lab, watching, url = two_wheels
@@ -205,7 +210,7 @@ def test_the_wheels_stand_half_a_second_after(two_wheels, eventually, moved, cut
                 elif cut == "silent":
                     page.silence()
                 else:
-                    lab.send_signal(signal.SIGKILL)
+                    lab.send_signal(signal.SIGKILL if cut == "killed" else signal.SIGTSTP)
             await asyncio.sleep(3.0)
             if cut in ("stop", "second page"):
                 assert not page.state["armed"] and page.state["messages"]
@@ -284,11 +289,23 @@ def test_strangers_stay_outside_and_one_page_drives(two_wheels, eventually):
     eventually(lambda: all(abs(v) < STANDSTILL for v in watching.speeds()))
 
 
-def test_an_address_of_another_machine_is_told_loudly(process, eventually):
+@pytest.mark.parametrize(
+    ("host", "own"), [("0.0.0.0", "http://127.0.0.1:"), ("::", "http://[::1]:")]
+)
+def test_a_server_of_all_interfaces_warns_and_prints_an_address_that_opens(
+    process, eventually, host, own
+):
     process("motor_plant")
-    lab = process("lab", "--no-browser", "--host", "0.0.0.0")
-    address(lab, eventually)
-    assert "WARNING: served on 0.0.0.0" in lab.output
+    lab = process("lab", "--no-browser", "--host", host)
+    url = address(lab, eventually)
+    assert f"WARNING: served on {host}" in lab.output
+    assert url.startswith(own)
+
+    async def open_page() -> None:
+        async with Client(url) as page:
+            await page.until(lambda: page.role.get("drives"))
+
+    asyncio.run(open_page())
 
 
 def test_a_wheel_name_that_holds_html_is_refused(process):
