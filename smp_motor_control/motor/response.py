@@ -129,38 +129,13 @@ def zero_order_hold(
     """
     given = (dc_gain, time_constant, product, interval)
     gain, tau, tp, t = np.broadcast_arrays(*(np.atleast_1d(np.asarray(x, float)) for x in given))
-    g, h, g_rate, h_rate, tp = _coefficients(tau, tp, t)
+    motors = [FreeResponse(*constants) for constants in zip(tau.tolist(), tp.tolist())]
+    tp = np.array([one.product for one in motors])
+    g, h, g_rate, h_rate = np.array([one.after(x) for one, x in zip(motors, t.tolist())]).T
     swept = tau * (1.0 - g) - tp * g_rate
     return HeldResponse(
         np.stack((np.stack((g, h), axis=-1), np.stack((g_rate, h_rate), axis=-1)), axis=-2),
         np.stack((gain * (1.0 - g), -gain * g_rate), axis=-1),
         np.stack((swept, tp * (1.0 - g)), axis=-1),
         gain * (t - swept),
-    )
-
-
-def _coefficients(tau: Array, tp: Array, t: Array) -> tuple[Array, Array, Array, Array, Array]:
-    """Return the coefficients of :meth:`FreeResponse.after` for a batch, and the products used."""
-    first_order = tp <= MAX_FIRST_ORDER_RATIO * tau * tau
-    product = np.where(first_order, tau * tau, tp)  # placeholder where the result is not used
-    half = -0.5 * tau / product
-    square = half * half - 1.0 / product
-    root = np.sqrt(np.abs(square))
-    paired = square < 0.0
-    slow = np.where(paired, half, 1.0 / (product * (half - root)))
-    gap = np.where(paired | (root == 0.0), 1.0, 2.0 * root)
-    angle = root * t
-    cosine, sine = np.cos(angle), t * np.sinc(angle / np.pi)
-    spread = np.where(root == 0.0, t, -np.expm1(-gap * t) / gap)
-    decay = np.exp(slow * t)
-    h = decay * np.where(paired, sine, spread)
-    g = np.where(paired, decay * cosine, decay) - slow * h
-    h_rate = np.where(paired, decay * cosine, np.exp((half - root) * t)) + slow * h
-    alone = np.exp(-t / tau)
-    return (
-        np.where(first_order, alone, g),
-        np.where(first_order, 0.0, h),
-        np.where(first_order, -alone / tau, -h / product),
-        np.where(first_order, 0.0, h_rate),
-        np.where(first_order, 0.0, tp),
     )

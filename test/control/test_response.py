@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
-from smp_motor_control.motor.response import FreeResponse, zero_order_hold
+from smp_motor_control.motor.response import zero_order_hold
 
 GAIN, TAU = 20.0, 0.05
 # tp / tau^2: oscillating, a double root, real roots, and L/R of 50 us and 50 ns.
@@ -36,16 +36,6 @@ def test_held_response_is_the_matrix_exponential(share, interval):
     assert np.abs((held.forced[0] - truth[:2, 3]) / size).max() < tolerance * GAIN
     assert held.angle_transition[0] * size == pytest.approx(truth[2, :2] * size, abs=1e-11)
     assert held.angle_forced[0] == pytest.approx(truth[2, 3], abs=1e-10)
-
-
-@pytest.mark.parametrize("share", [*SHARES, 0.0])
-def test_scalar_and_batched_response_are_the_same(share):
-    times = np.geomspace(1e-5, 3.0, 30)
-    held = zero_order_hold(GAIN, TAU, share * TAU**2, times)
-    free = FreeResponse(TAU, share * TAU**2)
-    for k, t in enumerate(times):
-        g, h, g_rate, h_rate = free.after(t)
-        assert held.transition[k].ravel() == pytest.approx([g, h, g_rate, h_rate], rel=1e-12)
 
 
 def test_a_decayed_pole_leaves_the_motor_of_first_order():
