@@ -132,10 +132,6 @@ class PidOutput(NamedTuple):
     saturated: bool  # whether clamping changed the command
 
 
-_NAN = math.nan
-_INF = math.inf
-
-
 class Pid:
     """PID controller with its integral and derivative state.
 
@@ -146,6 +142,7 @@ class Pid:
     """
 
     gains: PidGains  # in force
+    tracking_time_constant: float  # effective, of back-calculation [s]
     i_term: float  # integral term of the next step
     _previous: float | None  # c r - y of the previous step
     _rate: float  # filtered rate of c r - y
@@ -154,29 +151,11 @@ class Pid:
 
     def __init__(self, gains: PidGains) -> None:
         self.reset()
-        self._adopt(gains)
+        self._use(gains)
 
-    def _adopt(self, gains: PidGains) -> None:
-        """Copy the settings to attributes, which saves look-ups in a step."""
+    def _use(self, gains: PidGains) -> None:
         self.gains = gains
-        self._p, self._i, self._d = gains.p, gains.i, gains.d
-        self._u_min, self._u_max = gains.u_clamp_min, gains.u_clamp_max
-        self._i_min, self._i_max = gains.i_clamp_min, gains.i_clamp_max
-        strategy = gains.antiwindup_strategy
-        self._conditional = strategy == "conditional_integration"
-        self._back_calculation = strategy == "back_calculation"
-        self._tracking = gains.effective_tracking_time_constant
-        self._deadband = gains.error_deadband
-        self._weight_p, self._weight_d = gains.setpoint_weight_p, gains.setpoint_weight_d
-        self._filter = gains.derivative_filter_time_constant
-        self._ff_static = gains.feedforward_static
-        self._ff_velocity = gains.feedforward_velocity
-        self._ff_acceleration = gains.feedforward_acceleration
-
-    @property
-    def tracking_time_constant(self) -> float:
-        """Effective time constant of back-calculation [s]."""
-        return self._tracking
+        self.tracking_time_constant = gains.effective_tracking_time_constant
 
     @property
     def saturated(self) -> bool:
@@ -200,32 +179,35 @@ class Pid:
         no effect on later ones.  Before the first step the reference is assumed equal to the
         measurement, so that a turning wheel gets no derivative kick without ``setpoint_weight_d``.
         """
-        if not EPSILON < dt < _INF:
+        if not EPSILON < dt < math.inf:
             if -EPSILON <= dt <= EPSILON:
                 return self._last_output
             raise ParameterError(f"dt is {dt} s; it must be finite and not negative")
+        gains = self.gains
         error = reference - measurement
-        weighted = self._weight_d * reference - measurement
+        weighted = gains.setpoint_weight_d * reference - measurement
         rate = self._filtered_rate(weighted, measurement, dt, error_rate)
         i_term = self.i_term
-        p_term = self._p * (self._weight_p * reference - measurement)
-        d_term = self._d * rate
+        p_term = gains.p * (gains.setpoint_weight_p * reference - measurement)
+        d_term = gains.d * rate
         feedforward = self._feedforward(reference, acceleration)
         unsaturated = p_term + i_term + d_term + feedforward
         inputs = error + acceleration + (error_rate or 0.0)
         if inputs - inputs != 0.0 or unsaturated != unsaturated:  # NaN, or an infinite input
-            return self._refuse()
+            nan = math.nan
+            self._last_output = PidOutput(nan, nan, nan, self.i_term, nan, nan, False)
+            return self._last_output
         output = unsaturated
-        if output > self._u_max:
-            output = self._u_max
-        elif output < self._u_min:
-            output = self._u_min
-        if error > self._deadband or error < -self._deadband:
+        if output > gains.u_clamp_max:
+            output = gains.u_clamp_max
+        elif output < gains.u_clamp_min:
+            output = gains.u_clamp_min
+        if error > gains.error_deadband or error < -gains.error_deadband:
             i_term = self._integrate(error, dt, output, unsaturated)
             self.i_term = i_term
         if error_rate is None:
             self._previous = weighted
-        self._rate = rate if -_INF < rate < _INF else 0.0
+        self._rate = rate if math.isfinite(rate) else 0.0
         self._last_inputs = (reference, measurement, acceleration)
         last = PidOutput(
             output, unsaturated, p_term, i_term, d_term, feedforward, output != unsaturated
@@ -237,56 +219,58 @@ class Pid:
         self, weighted: float, measurement: float, dt: float, given: float | None
     ) -> float:
         """Return the rate of ``c r - y`` by backward Euler of ``s / (1 + T s)``."""
+        filter_time = self.gains.derivative_filter_time_constant
         if given is None:
             previous = self._previous
             if previous is None:
-                previous = self._weight_d * measurement - measurement
+                previous = self.gains.setpoint_weight_d * measurement - measurement
             change = weighted - previous
-        elif self._filter == 0.0:
+        elif filter_time == 0.0:
             return given
         else:
             change = given * dt
-        return (self._filter * self._rate + change) / (self._filter + dt)
+        return (filter_time * self._rate + change) / (filter_time + dt)
 
     def _feedforward(self, reference: float, acceleration: float) -> float:
         """Return the feed-forward voltage.
 
         Dry friction opposes the reference; at a reference of zero it opposes the acceleration.
         """
-        value = self._ff_velocity * reference + self._ff_acceleration * acceleration
-        if self._ff_static:
+        gains = self.gains
+        value = gains.feedforward_velocity * reference
+        value += gains.feedforward_acceleration * acceleration
+        if gains.feedforward_static:
             direction = reference or acceleration
             if direction > 0.0:
-                return value + self._ff_static
+                return value + gains.feedforward_static
             if direction < 0.0:
-                return value - self._ff_static
+                return value - gains.feedforward_static
         return value
 
     def _integrate(self, error: float, dt: float, output: float, unsaturated: float) -> float:
         """Return the integral after a step of ``dt``, with anti-windup."""
-        gain = self._i
-        old = self.i_term
-        if self._back_calculation:
-            if -EPSILON <= gain <= EPSILON:
+        gains, old = self.gains, self.i_term
+        strategy, tracking = gains.antiwindup_strategy, self.tracking_time_constant
+        if strategy == "back_calculation":
+            if -EPSILON <= gains.i <= EPSILON:
                 return old
-            if self._tracking > 0.0:
-                new = old + dt * (gain * error + 1.0 / self._tracking * (output - unsaturated))
+            if tracking > 0.0:
+                new = old + dt * (gains.i * error + 1.0 / tracking * (output - unsaturated))
             else:
-                new = old + dt * gain * error + (output - unsaturated)
-        elif self._conditional and output != unsaturated and error * unsaturated > 0.0:
+                new = old + dt * gains.i * error + (output - unsaturated)
+        elif (
+            strategy == "conditional_integration"
+            and output != unsaturated
+            and error * unsaturated > 0.0
+        ):
             new = old
         else:
-            new = old + dt * gain * error
-        if new > self._i_max:
-            return self._i_max
-        if new < self._i_min:
-            return self._i_min
-        return new if -_INF < new < _INF else old
-
-    def _refuse(self) -> PidOutput:
-        """Return NaN for a step with non-finite inputs."""
-        self._last_output = PidOutput(_NAN, _NAN, _NAN, self.i_term, _NAN, _NAN, False)
-        return self._last_output
+            new = old + dt * gains.i * error
+        if new > gains.i_clamp_max:
+            return gains.i_clamp_max
+        if new < gains.i_clamp_min:
+            return gains.i_clamp_min
+        return new if math.isfinite(new) else old
 
     def reset(self, save_i_term: bool = False) -> None:
         """Discard the state, except the integral if ``save_i_term``."""
@@ -304,24 +288,24 @@ class Pid:
         Without integral action it is set to zero, as nothing could unwind it later.
         """
         before = self._without_integral()
-        self._adopt(gains)
+        self._use(gains)
         if self._last_inputs is not None and self._previous is not None:
-            self._previous = self._weight_d * self._last_inputs[0] - self._last_inputs[1]
-        self._store_integral(self.i_term + before - self._without_integral())
+            reference, measurement, _ = self._last_inputs
+            self._previous = gains.setpoint_weight_d * reference - measurement
+        integral = self.i_term + before - self._without_integral()
+        if abs(gains.i) <= EPSILON or not math.isfinite(integral):
+            integral = 0.0
+        self.i_term = min(max(integral, gains.i_clamp_min), gains.i_clamp_max)
+        self._last_output = self._last_output._replace(i_term=self.i_term)
 
     def _without_integral(self) -> float:
         """Return the command at the last inputs without its integral term."""
         if self._last_inputs is None:
             return 0.0
         reference, measurement, acceleration = self._last_inputs
+        gains = self.gains
         return (
-            self._p * (self._weight_p * reference - measurement)
-            + self._d * self._rate
+            gains.p * (gains.setpoint_weight_p * reference - measurement)
+            + gains.d * self._rate
             + self._feedforward(reference, acceleration)
         )
-
-    def _store_integral(self, value: float) -> None:
-        if abs(self._i) <= EPSILON or not math.isfinite(value):
-            value = 0.0
-        self.i_term = min(max(value, self._i_min), self._i_max)
-        self._last_output = self._last_output._replace(i_term=self.i_term)
