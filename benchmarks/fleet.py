@@ -67,7 +67,7 @@ def by_two(paths: list[str], settings: tuple[Any, ...], kill: bool) -> tuple[Any
         warm(cluster, settings, paths[:1])
         found: dict[str, Any] = {}
         begin = time.monotonic()
-        for path, result in fleet.on_cluster(paths, settings, cluster.scheduler_address):
+        for path, result in fleet.identify_on_cluster(paths, settings, cluster.scheduler_address):
             found[path] = result
             if kill and len(found) == len(paths) // 2:
                 victim = next(iter(cluster.workers.values())).pid

@@ -90,14 +90,16 @@ class Fourier(Excitation):
             raise ParameterError(f"tones is {self.tones!r}; it must be at least 2")
 
     def _shape(self, time: Array) -> Array:
-        frequencies, phases, peak = multisine(self.lowest, self.highest, self.tones, self.seed)
+        frequencies, phases, peak = draw_multisine(self.lowest, self.highest, self.tones, self.seed)
         tones = np.sin(2 * math.pi * np.outer(time, frequencies) + phases)
         summed: Array = tones.sum(axis=1) / peak
         return summed
 
 
 @lru_cache(maxsize=32)
-def multisine(lowest: float, highest: float, tones: int, seed: int) -> tuple[Array, Array, float]:
+def draw_multisine(
+    lowest: float, highest: float, tones: int, seed: int
+) -> tuple[Array, Array, float]:
     """Return frequencies, phases and full scale of the random draw with the lowest peak.
 
     Incommensurate tones have no period over which to optimise phases.  The best draw still peaks at

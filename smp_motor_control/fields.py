@@ -24,7 +24,7 @@ class Described(NamedTuple):
     maximum: float = math.inf
     read_only: bool = False
     name: str = ""
-    endless: bool = False  # whether a parameter of 0 means infinity
+    zero_is_infinite: bool = False  # whether a parameter of 0 means infinity
 
     @property
     def limited(self) -> bool:
@@ -67,7 +67,7 @@ def parameters_in(settings: type, default: Any = None, prefix: str = "") -> dict
         value = field.default if default is None else getattr(default, field.name)
         if isinstance(known, Described):
             known = known._replace(default=value)
-            if known.endless:
+            if known.zero_is_infinite:
                 shown = 0.0 if math.isinf(value) else value
                 known = known._replace(default=shown, text=f"{known.text.rstrip('.')}; 0 for none.")
             found[prefix + (known.name or field.name)] = known
@@ -78,13 +78,13 @@ def parameters_in(settings: type, default: Any = None, prefix: str = "") -> dict
     return found
 
 
-def settings_of(settings: type[S], values: Mapping[str, Any], prefix: str = "") -> S:
+def build_settings(settings: type[S], values: Mapping[str, Any], prefix: str = "") -> S:
     """Build settings from the values of their parameters; errors name the prefix."""
     given: dict[str, Any] = {}
     for field, known in _described_fields(settings):
         if isinstance(known, Described):
             value = values[prefix + (known.name or field.name)]
-            given[field.name] = value or math.inf if known.endless else value
+            given[field.name] = value or math.inf if known.zero_is_infinite else value
             continue
         inside = prefix + known.prefix
         there = [bool(values[inside + name]) for name in known.needs]
@@ -105,7 +105,7 @@ def check_limits(settings: Any) -> None:
 
 def _build_nested(known: _Nested, values: Mapping[str, Any], prefix: str) -> Any:
     try:
-        return settings_of(known.kind, values, prefix)
+        return build_settings(known.kind, values, prefix)
     except ParameterError as error:
         if not known.prefix or known.needs:
             raise

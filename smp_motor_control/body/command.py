@@ -36,7 +36,7 @@ class BodyCommand:
     def reset(self) -> None:
         """Discard all commands."""
         self._velocity: tuple[float, float] | None = None
-        self._born = -math.inf
+        self._issued_at = -math.inf
 
     def receive(
         self, linear: float, angular: float, age: float | None, steady_now: float
@@ -46,13 +46,13 @@ class BodyCommand:
             return Verdict.STALE
         if not (math.isfinite(linear) and math.isfinite(angular)):
             return Verdict.NOT_FINITE
-        self._born = steady_now - max(age or 0.0, 0.0)
+        self._issued_at = steady_now - max(age or 0.0, 0.0)
         self._velocity = (linear, angular)
         return Verdict.ZERO_STAMP if age is None else Verdict.ACCEPTED
 
     def age(self, steady_now: float) -> float:
         """Return the age of the newest command [s]."""
-        return steady_now - self._born
+        return steady_now - self._issued_at
 
     def timed_out(self, steady_now: float) -> bool:
         """Return whether the newest command has expired."""

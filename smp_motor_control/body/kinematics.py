@@ -34,7 +34,7 @@ class SkidSteer:
     right_wheel_radius_multiplier: float = described(1.0, "Correction of the right radius.")
     max_wheel_speed: float = described(
         math.inf, "Maximum speed of every wheel [rad/s]; commands beyond it are scaled.",
-        minimum=0.0, name="max_wheel_velocity", endless=True,
+        minimum=0.0, name="max_wheel_velocity", zero_is_infinite=True,
     )  # fmt: skip
 
     def __post_init__(self) -> None:
@@ -68,14 +68,14 @@ class SkidSteer:
         left, right = left * self.left_radius, right * self.right_radius
         return (left + right) / 2.0, (right - left) / self.effective_separation
 
-    def reachable_share(self, linear: float, angular: float) -> float:
+    def compute_speed_scale(self, linear: float, angular: float) -> float:
         """Return the factor, at most 1, that scales a command to the wheels' speed limit."""
         fastest = max(map(abs, self.wheel_speeds(linear, angular)))
         if math.isinf(fastest):  # overflow
             return 0.0
         return 1.0 if fastest <= self.max_wheel_speed else self.max_wheel_speed / fastest
 
-    def reachable_wheel_speeds(self, linear: float, angular: float) -> SideSpeeds:
+    def limit_wheel_speeds(self, linear: float, angular: float) -> SideSpeeds:
         """Return the wheel speeds of a command, scaled to their limit."""
-        share = self.reachable_share(linear, angular)
+        share = self.compute_speed_scale(linear, angular)
         return self.wheel_speeds(linear * share, angular * share)

@@ -111,10 +111,12 @@ def load_motors(path: str | Path, wheels: Iterable[str] | None = None) -> dict[s
 def extract_motors(parameters: Mapping[str, Any]) -> dict[str, Any]:
     """Return the motors in the parameters of a node, by wheel."""
     start = "motors."
-    return nest({n.removeprefix(start): v for n, v in parameters.items() if n.startswith(start)})
+    return nest_parameters(
+        {n.removeprefix(start): v for n, v in parameters.items() if n.startswith(start)}
+    )
 
 
-def nest(dotted: Mapping[str, Any]) -> dict[str, Any]:
+def nest_parameters(dotted: Mapping[str, Any]) -> dict[str, Any]:
     """Return nested mappings from ROS parameter names with dots."""
     top: dict[str, Any] = {}
     for key, value in dotted.items():

@@ -44,7 +44,7 @@ def drive_wheels(
     client: RobotClient, steps: Sequence[tuple[str, float, float]], wheels: Sequence[str]
 ) -> Times:
     """Drive all wheels through steps of (name, rad/s, s) and stop in any case."""
-    _refuse_rivals(client)
+    _refuse_other_senders(client)
     publisher = client.node.create_publisher(JointState, "wheel_setpoints", STREAM_PUBLISHER)
     message = JointState(name=[get_joint_name(wheel) for wheel in wheels])
 
@@ -108,7 +108,7 @@ def _now(client: RobotClient) -> float:
     return float(client.node.get_clock().now().nanoseconds * 1e-9)
 
 
-def _refuse_rivals(client: RobotClient) -> None:
+def _refuse_other_senders(client: RobotClient) -> None:
     """Raise when another node sends set-points."""
     heard: list[JointState] = []
     with client.listen(JointState, {"wheel_setpoints": heard.append}):

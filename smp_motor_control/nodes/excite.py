@@ -69,12 +69,12 @@ class Settings:
                 f"amplitude is {self.amplitude:g} V; it must not exceed max_voltage, "
                 f"{self.max_voltage:g} V"
             )
-        self.signal_of(0)
+        self.make_signal(0)
 
     def chosen(self) -> tuple[str, ...]:
         return self.wheel_names if "all" in self.wheels else self.wheels
 
-    def signal_of(self, wheel: int) -> Excitation:
+    def make_signal(self, wheel: int) -> Excitation:
         """Return the bounded signal of the n-th wheel."""
         kind = SIGNALS[self.signal]
         given = {f.name: getattr(self, f.name) for f in fields(kind) if hasattr(self, f.name)}
@@ -96,7 +96,7 @@ class Excite(Node):
         self._states: dict[str, PublisherWatch] = {}
         bounds = Bounds(speed=settings.max_speed, current=settings.max_current)
         for k, wheel in enumerate(settings.chosen()):
-            signal = settings.signal_of(k)
+            signal = settings.make_signal(k)
             signal(0.0)  # initialise before the first period
             self._outputs.append((MotorWriter(self, f"{wheel}/"), signal))
             self._watched[wheel] = Protection(bounds)

@@ -5,7 +5,7 @@ The stock executor rebuilds its wait set and wraps every callback in a task for 
 This one rebuilds the wait set only when an entity is created or destroyed and calls plain
 callbacks of subscriptions and timers directly; coroutines and other entities are handled as in
 the stock executor.  While messages arrive in quick succession it waits for messages, timers and
-guard conditions only, and checks the other entities every :data:`LOOK_PERIOD_NS`.
+guard conditions only, and checks the other entities every :data:`SERVICE_PERIOD_NS`.
 """
 
 import inspect
@@ -22,7 +22,7 @@ from rclpy.waitable import NumberOfEntities
 
 _NO_TIMEOUT = -1
 
-LOOK_PERIOD_NS = 20_000_000
+SERVICE_PERIOD_NS = 20_000_000
 """Maximum wait of services, clients, events and actions during a stream of messages."""
 
 
@@ -92,7 +92,7 @@ class _WaitSet:
         return [w for w in self.waitables if w.is_ready(self._waits)]
 
 
-class OwnerReads(CallbackGroup):
+class PolledSubscriptions(CallbackGroup):
     """Subscriptions whose owner reads them in batches; the executor ignores them."""
 
     def can_execute(self, entity: Any) -> bool:
@@ -115,12 +115,12 @@ class LeanExecutor(SingleThreadedExecutor):
         nodes = self.get_nodes()
         kinds = ("subscriptions", "timers", "clients", "services", "guards", "waitables")
         return tuple(
-            # Subscriptions of OwnerReads and their events, which data also trigger, wake nobody.
+            # Neither polled subscriptions nor their events, which data also trigger, wake it.
             tuple(
                 e
                 for node in nodes
                 for e in getattr(node, kind)
-                if not isinstance(getattr(e, "callback_group", None), OwnerReads)
+                if not isinstance(getattr(e, "callback_group", None), PolledSubscriptions)
             )
             for kind in kinds
         )
@@ -154,7 +154,7 @@ class LeanExecutor(SingleThreadedExecutor):
             for kind, take in (("client", self._take_client), ("service", self._take_service)):
                 for entity in waits.ready(kind):
                     self._do_stock(entity, take)
-        self._pace(bool(messages), waits is everything)
+        self._schedule_services(bool(messages), waits is everything)
         if self._tasks:
             self._do_tasks()
 
@@ -164,12 +164,12 @@ class LeanExecutor(SingleThreadedExecutor):
         except InvalidHandle:  # destroyed by a callback of this round
             return None
 
-    def _pace(self, heard: bool, looked: bool) -> None:
+    def _schedule_services(self, heard: bool, looked: bool) -> None:
         """Set until when to wait for messages only."""
         now = time.monotonic_ns()
         if looked:
-            in_succession = heard and now - self._heard < LOOK_PERIOD_NS
-            self._stream_until = now + LOOK_PERIOD_NS if in_succession else 0
+            in_succession = heard and now - self._heard < SERVICE_PERIOD_NS
+            self._stream_until = now + SERVICE_PERIOD_NS if in_succession else 0
         if heard:
             self._heard = now
 

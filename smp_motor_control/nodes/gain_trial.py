@@ -32,8 +32,8 @@ class LoopWatch:
     def __init__(self, supply: float) -> None:
         self.supply = supply  # [V]
         self.seen: deque[tuple[float, PidState]] = deque()
-        self.usual_error = self.usual_swing = 0.0
-        self.usual_dt = self.since = math.inf
+        self.baseline_error = self.baseline_swing = 0.0
+        self.baseline_dt = self.since = math.inf
         self.silent_polls = 0
 
     def take(self, message: PidState) -> None:
@@ -47,10 +47,10 @@ class LoopWatch:
     def begin(self) -> None:
         """Use the states so far as the baseline and start the trial."""
         states = [message for _, message in self.seen]
-        self.usual_error = _rms([s.error for s in states])
-        self.usual_swing = _mean_change([s.output for s in states])
+        self.baseline_error = _rms([s.error for s in states])
+        self.baseline_swing = _mean_change([s.output for s in states])
         if states:
-            self.usual_dt = sorted(s.dt for s in states)[len(states) // 2]
+            self.baseline_dt = sorted(s.dt for s in states)[len(states) // 2]
         self.since = time.monotonic()
         self.silent_polls = 0
 
@@ -72,18 +72,18 @@ class LoopWatch:
 
     def _find_instability(self, states: list[PidState]) -> str | None:
         swing = _mean_change([s.output for s in states])
-        if swing > max(0.25 * self.supply, 3 * self.usual_swing):
+        if swing > max(0.25 * self.supply, 3 * self.baseline_swing):
             return f"its output swings by {swing:.2g} V from step to step"
         clamped = sum(s.saturated for s in states) / len(states)
         if clamped > 0.5:
             return f"its output is clamped {100 * clamped:.0f} % of the time"
-        if any(max(s.dt, s.age) > STARVED_RATIO * self.usual_dt for s in states):
+        if any(max(s.dt, s.age) > STARVED_RATIO * self.baseline_dt for s in states):
             return None  # the computer's delays, not the gains, affect the speed
         error = _rms([s.error for s in states])
         asked = max(abs(s.reference) for s in states)
         moved = max(s.reference for s in states) - min(s.reference for s in states)
         # A lag behind a moving reference is not a fault.
-        if error > max(0.3 * asked + moved, 3 * self.usual_error, 0.1):
+        if error > max(0.3 * asked + moved, 3 * self.baseline_error, 0.1):
             return f"its speed is {error:.2g} rad/s off at {asked:.2g} rad/s"
         return None
 

@@ -22,7 +22,7 @@ from smp_interfaces.msg import MotorDescription, MotorParameters, MotorState, Pi
 from smp_motor_control import get_controller_name, get_joint_name
 from smp_motor_control.arrays import Array
 from smp_motor_control.nodes import runtime
-from smp_motor_control.nodes.executor import OwnerReads
+from smp_motor_control.nodes.executor import PolledSubscriptions
 from smp_motor_control.nodes.robot_client import RobotClient
 
 COLUMNS = ("voltage", "current", "speed", "setpoint", "reference", "prediction")
@@ -32,20 +32,20 @@ SLOT_S = 0.005  # interval of the common time grid; the last sample in it counts
 MAX_LATE_SLOTS = 4  # delay of one wheel's samples after another's [slots]
 MAX_OFFSET_SLOTS = 200  # longest lag of a stream; a longer one shows a clock that was set
 FRAME_S = 1 / 30  # period of batches and of commands
-KEPT_S = 60.0  # length of the kept history
-COMMAND_S = 0.3  # age at which a command ends
-UNWATCHED_S = 0.5  # longest time for which nobody may watch the sender of commands
+HISTORY_S = 60.0  # length of the kept history
+COMMAND_TIMEOUT_S = 0.3  # age at which a command ends
+WATCH_TIMEOUT_S = 0.5  # longest time for which nobody may watch the sender of commands
 BODY_TIMEOUT_S = 0.6  # from the last command to the body until skid_steer is idle
-ZERO_S = 1.0  # duration of zero commands after a drive
-DIAGNOSTICS_S = 3.0  # age at which a report is dropped
+ZERO_TIME_S = 1.0  # duration of zero commands after a drive
+DIAGNOSTICS_TIMEOUT_S = 3.0  # age at which a report is dropped
 
-_QUEUE = QoSProfile(depth=500, reliability=ReliabilityPolicy.BEST_EFFORT)
+_STREAM_QOS = QoSProfile(depth=500, reliability=ReliabilityPolicy.BEST_EFFORT)
 
 Plan = Sequence[tuple[float, float]]
 """Set-points of a wheel: seconds since the begin, and rad/s from then on."""
 
 
-def decode(messages: Sequence[bytes], count: int) -> tuple[Array, Array]:
+def decode_numbers(messages: Sequence[bytes], count: int) -> tuple[Array, Array]:
     """Return stamps [s] and the first ``count`` numbers of serialized messages with a header.
 
     References
@@ -67,8 +67,8 @@ class History:
     """The last minute of all wheels on a common time grid, shape (slots, wheels, columns)."""
 
     def __init__(self, wheels: int) -> None:
-        self._rows = np.full((int(KEPT_S / SLOT_S), wheels, len(COLUMNS)), math.nan)
-        self.newest = self._told = self.origin = -1  # slots: newest, last taken, first of all
+        self._rows = np.full((int(HISTORY_S / SLOT_S), wheels, len(COLUMNS)), math.nan)
+        self.newest = self._taken = self.origin = -1  # slots: newest, last taken, first of all
 
     def add(self, wheel: int, columns: slice, stamps: Array, values: Array) -> None:
         """Put samples of one wheel into their slots."""
@@ -76,7 +76,7 @@ class History:
         size, newest = len(self._rows), int(slots[-1])
         if self.newest < 0 or not -MAX_OFFSET_SLOTS <= newest - self.newest < size:
             self._rows[:] = math.nan  # the first samples, or the clock was set
-            self.newest = self._told = newest
+            self.newest = self._taken = newest
             self.origin = newest if self.origin < 0 else self.origin
         elif newest > self.newest:
             self._rows[np.arange(self.newest + 1, newest + 1) % size] = math.nan
@@ -85,8 +85,8 @@ class History:
 
     def take(self) -> tuple[Array, Array]:
         """Return slots since the last call and their rows, without rows that hold nothing."""
-        end = max(self.newest - MAX_LATE_SLOTS, self._told)
-        slots, self._told = np.arange(self._told + 1, end + 1), end
+        end = max(self.newest - MAX_LATE_SLOTS, self._taken)
+        slots, self._taken = np.arange(self._taken + 1, end + 1), end
         rows = self._rows[slots % len(self._rows)]
         some = np.isfinite(rows[:, :, :3]).any(axis=(1, 2))
         return slots[some], rows[some]
@@ -120,8 +120,8 @@ class LiveLink:
         node = client.node
         self._streams = [
             (kind, numbers, k, columns, node.create_subscription(
-                kind, f"{wheel}/{topic}", lambda _: None, _QUEUE, raw=True,
-                callback_group=OwnerReads(),
+                kind, f"{wheel}/{topic}", lambda _: None, _STREAM_QOS, raw=True,
+                callback_group=PolledSubscriptions(),
             ))
             for k, wheel in enumerate(wheels)
             for kind, topic, numbers, columns in (
@@ -164,7 +164,7 @@ class LiveLink:
         if self.armed:
             self._plans = time.monotonic(), plans, duration
 
-    def rest(self) -> None:
+    def end_plans(self) -> None:
         """End what :meth:`follow` began with a set-point of zero."""
         if self._plans is not None:
             self._plans = None
@@ -172,23 +172,23 @@ class LiveLink:
 
     def is_body_idle(self) -> bool:
         """Return whether skid_steer, after the last command to the body, yields the wheels."""
-        return time.monotonic() - self._body[2] > COMMAND_S + ZERO_S + BODY_TIMEOUT_S
+        return time.monotonic() - self._body[2] > COMMAND_TIMEOUT_S + ZERO_TIME_S + BODY_TIMEOUT_S
 
     def _on_timer(self) -> None:
         now = time.monotonic()
-        if self.armed and now - self.watched_at > UNWATCHED_S:
-            self.halt(f"nobody watched the page for {UNWATCHED_S:g} s")
+        if self.armed and now - self.watched_at > WATCH_TIMEOUT_S:
+            self.halt(f"nobody watched the page for {WATCH_TIMEOUT_S:g} s")
         if self._halt:
             self._stop_wheels()
         linear, angular, at = self._body
-        if now - at < COMMAND_S + ZERO_S:
-            fresh = self.armed and now - at < COMMAND_S
+        if now - at < COMMAND_TIMEOUT_S + ZERO_TIME_S:
+            fresh = self.armed and now - at < COMMAND_TIMEOUT_S
             self._send_twist(*((linear, angular) if fresh else (0.0, 0.0)))
         if self._plans is not None:
             begun, plans, duration = self._plans
             since = now - begun
             if since > duration:
-                self.rest()
+                self.end_plans()
             else:
                 self._send_setpoints({
                     wheel: next((v for t, v in reversed(plan) if since >= t), 0.0)
@@ -207,7 +207,7 @@ class LiveLink:
                 while (taken := handle.take_message(kind, True)) is not None:
                     messages.append(taken[0])
             if messages:
-                self.history.add(wheel, columns, *decode(messages, numbers))
+                self.history.add(wheel, columns, *decode_numbers(messages, numbers))
         if self.history.newest >= 0:
             slots, rows = self.history.take()
             if slots.size:
@@ -245,5 +245,5 @@ class LiveLink:
         for one in message.status:
             self.diagnostics[one.name] = now, ord(one.level), one.message
         for name, (at, *_) in list(self.diagnostics.items()):
-            if now - at > DIAGNOSTICS_S:
+            if now - at > DIAGNOSTICS_TIMEOUT_S:
                 del self.diagnostics[name]

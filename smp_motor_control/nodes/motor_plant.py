@@ -119,7 +119,7 @@ class MotorPlant(Node):
         self._nominal = max(entry.supply_voltage for entry in entries.values())
         self._supply.open_voltage = settings.battery_voltage or self._nominal
         self._simulated = self.get_clock().ros_time_is_active
-        self._origin = self._shown = self.get_clock().now().nanoseconds
+        self._origin = self._last_stamp = self.get_clock().now().nanoseconds
         start, self._wheels = self.instant(), []
         for seed, (name, entry) in enumerate(entries.items(), 97 * settings.seed):
             motor = DrivenMotor(entry, settings.drive, self._supply, start, seed)
@@ -172,10 +172,10 @@ class MotorPlant(Node):
         if not self._simulated:
             return time.monotonic()
         now = self.get_clock().now().nanoseconds
-        if not self._shown:  # first message of /clock
+        if not self._last_stamp:  # first message of /clock
             self._origin = now
-        self._origin += min(now - self._shown, 0)  # a clock set back counts as stopped
-        self._shown = now
+        self._origin += min(now - self._last_stamp, 0)  # a clock set back counts as stopped
+        self._last_stamp = now
         return (now - self._origin) * 1e-9
 
     def _sampling_instant(self) -> tuple[float, Any]:

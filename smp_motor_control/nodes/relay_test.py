@@ -65,7 +65,7 @@ class _Test:
         seen = self.seen
         with self.client.listen(MotorState, {f"{self.wheel}/motor_state": self.answer}):
             if not self.client.until(self._is_applied, TIMEOUT_S):
-                raise self._not_followed()
+                raise self._explain_rejected_command()
             self.client.spin(SETTLING_TIME_S)
             first = len(seen)
             if first < 20:
@@ -77,7 +77,7 @@ class _Test:
             self.centre = sum(late) / len(late)
             self.output = self.relay.bias + self.relay.amplitude
             self.client.spin(duration)
-        return self._around_rest(first)
+        return self._subtract_operating_point(first)
 
     def _is_applied(self) -> bool:
         """Return whether the hardware applies the constant voltage, if it reports this."""
@@ -86,7 +86,7 @@ class _Test:
         off = abs(self.seen[-1][2] - self.output)
         return not off > MAX_VOLTAGE_ERROR * self.relay.amplitude  # NaN: not reported
 
-    def _not_followed(self) -> RobotError:
+    def _explain_rejected_command(self) -> RobotError:
         topic = self.writer.publisher.topic_name
         if not self.writer.publisher.get_subscription_count():
             return RobotError(f"{topic}: no subscriber; start motor_plant or the robot's driver")
@@ -95,7 +95,7 @@ class _Test:
             f"{self.writer.owner or 'another node'} commands the wheel, end it first"
         )
 
-    def _around_rest(self, first: int) -> Oscillation:
+    def _subtract_operating_point(self, first: int) -> Oscillation:
         rows = np.array(self.seen[first:]).reshape(-1, 5)
         time, angle = (rows[:, k] - rows[:1, k] for k in (0, 4))
         bias, amplitude, centre = self.relay.bias, self.relay.amplitude, self.centre or 0.0
@@ -103,7 +103,7 @@ class _Test:
         # The applied voltage is at one of the relay's levels except where it switches.
         between = np.abs(np.abs(applied) - amplitude) > MAX_VOLTAGE_ERROR * amplitude
         if np.count_nonzero(between) > MAX_SHARE_BETWEEN * len(applied):
-            raise self._not_followed()
+            raise self._explain_rejected_command()
         return {
             "time": time,
             "voltage": rows[:, 1] - bias,
@@ -113,7 +113,7 @@ class _Test:
         }
 
 
-def oscillate(client: RobotClient, wheel: str, relay: Relay, duration: float) -> Oscillation:
+def run_relay_test(client: RobotClient, wheel: str, relay: Relay, duration: float) -> Oscillation:
     """Run the test on a wheel with its controller paused."""
     client.wait_for_wheels([wheel], TIMEOUT_S)
     with client.paused([wheel]):

@@ -167,7 +167,7 @@ class RobotClient:
             heard = self.until(
                 lambda: all(seen and seen[-1] - seen[0] > 0.5 for seen in stamps.values()), timeout
             )
-        self._refuse_doubled(watches)
+        self._refuse_two_publishers(watches)
         if not heard:
             silent = [wheel for wheel, seen in stamps.items() if not seen or seen[-1] == seen[0]]
             topic = ", ".join(
@@ -178,7 +178,7 @@ class RobotClient:
             )
         return {w: (len(s) - 1) / (s[-1] - s[0]) for w, s in stamps.items()}
 
-    def _refuse_doubled(self, watches: Mapping[str, PublisherWatch]) -> None:
+    def _refuse_two_publishers(self, watches: Mapping[str, PublisherWatch]) -> None:
         topics = [
             f"{wheel}/motor_state" for wheel, one in watches.items() if one.has_two_publishers
         ]
@@ -226,7 +226,7 @@ class RobotClient:
             self._clients[name] = self.node.create_client(kind, name)
         return self._clients[name]
 
-    def ask_all(
+    def call_services(
         self, kind: Any, requests: Mapping[str, Any], patience: float = TIMEOUT_S
     ) -> dict[str, Any]:
         """Call services concurrently; return the answers by service name."""
@@ -261,7 +261,7 @@ class RobotClient:
     def get_parameters(self, nodes: Mapping[str, Sequence[str]]) -> dict[str, dict[str, Any]]:
         """Return the parameters of nodes by name, without those that are not set."""
         requests = {f"{n}/{GET}": GetParameters.Request(names=list(p)) for n, p in nodes.items()}
-        answers = self.ask_all(GetParameters, requests)
+        answers = self.call_services(GetParameters, requests)
         found: dict[str, dict[str, Any]] = {}
         for node, names in nodes.items():
             pairs = zip(names, answers[f"{node}/{GET}"].values, strict=False)
@@ -277,7 +277,7 @@ class RobotClient:
         for node, values in nodes.items():
             given = [Parameter(n, value=v).to_parameter_msg() for n, v in values.items()]
             requests[f"{node}/{SET}"] = SetParametersAtomically.Request(parameters=given)
-        answers = self.ask_all(SetParametersAtomically, requests, patience)
+        answers = self.call_services(SetParametersAtomically, requests, patience)
         results = {node: answers[f"{node}/{SET}"].result for node in nodes}
         why = {node: result.reason for node, result in results.items() if not result.successful}
         if why:
@@ -288,7 +288,9 @@ class RobotClient:
 
     def get_states(self, nodes: Sequence[str]) -> dict[str, str]:
         """Return the states of lifecycle nodes, such as ``active``."""
-        answers = self.ask_all(GetState, {f"{n}/get_state": GetState.Request() for n in nodes})
+        answers = self.call_services(
+            GetState, {f"{n}/get_state": GetState.Request() for n in nodes}
+        )
         return {node: answers[f"{node}/get_state"].current_state.label for node in nodes}
 
     def change_states(self, nodes: Sequence[str], transition: str) -> None:
@@ -301,7 +303,7 @@ class RobotClient:
         left, states = list(nodes), {}
         for _ in range(3):
             if left:
-                self.ask_all(ChangeState, {f"{node}/change_state": request for node in left})
+                self.call_services(ChangeState, {f"{node}/change_state": request for node in left})
                 states = self.get_states(left)
                 left = [node for node in left if states[node] != _RESULTING_STATE[transition]]
         if left:
@@ -322,14 +324,14 @@ class RobotClient:
 
     def prepare(self, pending_restore: Mapping[str, Any]) -> None:
         """Get known to the controllers that :meth:`restore` halts, which takes time."""
-        for name in _halts(pending_restore):
+        for name in _deactivation_requests(pending_restore):
             self._client(ChangeState, name)
 
     def restore(self, pending_restore: Mapping[str, Any]) -> None:
         """Halt the wheels, set the previous gains and activate the controllers that were active."""
         if pending_restore.get("halt"):
             with contextlib.suppress(RobotError):  # one that is missing keeps no other moving
-                self.ask_all(ChangeState, _halts(pending_restore), HALT_S)
+                self.call_services(ChangeState, _deactivation_requests(pending_restore), HALT_S)
             self.spin(HALT_S)
         if pending_restore.get("gains"):
             self.set_parameters(pending_restore["gains"])
@@ -400,6 +402,6 @@ class RobotClient:
         return owner_known or self.node.count_publishers(f"{wheel}/motor_owner") == 0
 
 
-def _halts(pending_restore: Mapping[str, Any]) -> dict[str, ChangeState.Request]:
+def _deactivation_requests(pending_restore: Mapping[str, Any]) -> dict[str, ChangeState.Request]:
     request = ChangeState.Request(transition=Transition(id=Transition.TRANSITION_DEACTIVATE))
     return {f"{node}/change_state": request for node in pending_restore.get("halt", ())}

@@ -96,7 +96,7 @@ class Wheel:
         if math.isfinite(voltage):
             self.voltage, self.commanded = voltage, now
 
-    def wanted(self, now: float, supply: float) -> float:
+    def voltage_to_send(self, now: float, supply: float) -> float:
         """Return the voltage to send [V], limited to the supply."""
         self._driver.publish_owner(now)
         if now - self.commanded > self.settings.command_timeout:
@@ -160,14 +160,14 @@ class SerialDriver(Node):
         self._opened_at = now
         try:
             self._fd = os.open(self._settings.device, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
-            self._take_line(self._fd)
+            self._lock_and_configure(self._fd)
         except (OSError, termios.error, ValueError) as error:
             self._close(_error_text(error))
             return
         self._lines, self._problem = protocol.LineSplitter(), ""
         self._openings += 1
 
-    def _take_line(self, fd: int) -> None:
+    def _lock_and_configure(self, fd: int) -> None:
         """Lock and configure the device and flush its queues."""
         try:
             fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -181,13 +181,13 @@ class SerialDriver(Node):
 
     def _close(self, problem: str) -> None:
         self._problem = problem
-        self._forget()
+        self._discard_counts()
         if self._fd is not None:
             with contextlib.suppress(OSError):
                 os.close(self._fd)
             self._fd = None
 
-    def _forget(self) -> None:
+    def _discard_counts(self) -> None:
         self._before = None
         for wheel in self._wheels:
             wheel.reset()
@@ -222,7 +222,7 @@ class SerialDriver(Node):
         )
         if not 0.0 < dt < RESET_JUMP_S:
             self._resets += before is not None
-            self._forget()
+            self._discard_counts()
             self._before = state
         stamp = self.get_clock().now().to_msg()
         for wheel, count, current in zip(self._wheels, state.counts, state.currents):
@@ -235,7 +235,7 @@ class SerialDriver(Node):
 
     def _write(self, now: float) -> None:
         """Send commands to all motors unless the board is silent or the line is still busy."""
-        voltages = [wheel.wanted(now, self._supply) for wheel in self._wheels]
+        voltages = [wheel.voltage_to_send(now, self._supply) for wheel in self._wheels]
         if self._fd is None or self._before is None or now - self._heard_at > BOARD_TIMEOUT_S:
             return
         fresh = b""

@@ -20,7 +20,7 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 
 from smp_motor_control.errors import ParameterError, check_range
-from smp_motor_control.fields import Described, parameters_in, settings_of
+from smp_motor_control.fields import Described, build_settings, parameters_in
 
 S = TypeVar("S")
 
@@ -89,24 +89,24 @@ class Parameters(Generic[S]):
             if entry.limited:
                 check_range(name, values[name], entry.minimum, entry.maximum)
         try:
-            return settings_of(self._type, values)
+            return build_settings(self._type, values)
         except ArithmeticError as error:
             raise ParameterError(f"computation fails with these values: {error}") from error
 
-    def _with(self, parameters: Iterable[Parameter]) -> dict[str, Any]:
+    def _merge(self, parameters: Iterable[Parameter]) -> dict[str, Any]:
         mine = (p for p in parameters if p.name in self._entries)
         new = {p.name: coerce(p.name, p.value, self._entries[p.name].default) for p in mine}
         return {**self._values, **new}
 
     def _validate(self, parameters: list[Parameter]) -> msg.SetParametersResult:
         try:
-            self._check(self._build(self._with(parameters)))
+            self._check(self._build(self._merge(parameters)))
         except ParameterError as error:
             return msg.SetParametersResult(successful=False, reason=str(error))
         return msg.SetParametersResult(successful=True)
 
     def _replace(self, parameters: list[Parameter]) -> None:
-        values = self._with(parameters)
+        values = self._merge(parameters)
         if values == self._values:
             return
         self._values = values

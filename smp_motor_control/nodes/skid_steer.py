@@ -144,7 +144,7 @@ class SkidSteerNode(Node):
         if runtime.nanoseconds(message.header.stamp) not in self._sent:
             self._others_at = time.monotonic()
 
-    def _yields(self, now: float) -> bool:
+    def _should_yield(self, now: float) -> bool:
         """Return whether the body stands by its command, and another node sends set-points."""
         idle = self._command.timed_out(now) and not any(self._past_commands[0])
         return idle and now - self._others_at < YIELD_S
@@ -188,7 +188,7 @@ class SkidSteerNode(Node):
         if dt < MIN_STEP_S and not jumped:
             return
         asked = self._command.at(now)
-        if asked is not None and not self._yields(now):
+        if asked is not None and not self._should_yield(now):
             self._drive(asked, max(dt, MIN_STEP_S), now)
         if settings.open_loop:
             updated = asked is not None and self._odometry.update_open_loop(
@@ -204,11 +204,11 @@ class SkidSteerNode(Node):
     def _drive(self, asked: tuple[float, float], dt: float, now: float) -> None:
         """Limit the command, correct the heading and publish the set-points."""
         linear, angular = self._limit(asked, dt, now)
-        share = self._robot.reachable_share(linear, angular)
+        share = self._robot.compute_speed_scale(linear, angular)
         linear, angular = linear * share, angular * share
         self._past_commands = [(linear, angular), self._past_commands[0]]
         corrected = self._hold_heading(linear, angular, dt, now)
-        left, right = self._robot.reachable_wheel_speeds(linear, corrected)
+        left, right = self._robot.limit_wheel_speeds(linear, corrected)
         self._share = share
         self._setpoint.header.stamp = self.get_clock().now().to_msg()
         self._sent.append(runtime.nanoseconds(self._setpoint.header.stamp))

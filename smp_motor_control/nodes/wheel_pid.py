@@ -222,7 +222,7 @@ def _threads() -> list[int]:
         return [0]
 
 
-def _make() -> WheelPid:
+def make_node() -> WheelPid:
     node = WheelPid()
     if node.settings.autostart:
         node.trigger_configure()
@@ -230,4 +230,4 @@ def _make() -> WheelPid:
     return node
 
 
-main = partial(runtime.run, "wheel_pid", _make)
+main = partial(runtime.run, "wheel_pid", make_node)

@@ -67,7 +67,7 @@ class WheelTest:
     ) -> None:
         self._client, self._counters = client, counters
         self._watched = {wheel: Protection(bounds) for wheel in counters}
-        self.tapes = {wheel: WheelRecording() for wheel in counters}
+        self.recordings = {wheel: WheelRecording() for wheel in counters}
         self._commands = dict.fromkeys(counters, 0.0)
         self._laws: Mapping[str, Law] = {}
         self._phase = 0
@@ -77,10 +77,10 @@ class WheelTest:
     @contextlib.contextmanager
     def open(self) -> Iterator["WheelTest"]:
         """Subscribe and allow commands inside the block."""
-        self._writers = {w: MotorWriter(self._client.node, f"{w}/") for w in self.tapes}
+        self._writers = {w: MotorWriter(self._client.node, f"{w}/") for w in self.recordings}
         try:
             listen = self._client.listen_to_wheels
-            with listen(MotorState, "motor_state", self.tapes, self._answer):
+            with listen(MotorState, "motor_state", self.recordings, self._answer):
                 yield self
         finally:
             for writer in self._writers.values():
@@ -103,7 +103,7 @@ class WheelTest:
     def _answer(self, wheel: str, message: MotorState) -> None:
         stamp = seconds(message.header.stamp)
         age = self._client.node.get_clock().now().nanoseconds * 1e-9 - stamp
-        self.tapes[wheel].rows.append((
+        self.recordings[wheel].rows.append((
             stamp, age, self._commands[wheel], message.voltage, message.velocity,
             message.position, self._counters[wheel](message), float(self._phase),
         ))  # fmt: skip

@@ -39,7 +39,7 @@ class Reference(NamedTuple):
 
 def _limit(name: str, unit: str) -> Any:
     text = f"Maximum {name} of the reference [{unit}]."
-    return described(math.inf, text, minimum=0.0, name=f"max_{name}", endless=True)
+    return described(math.inf, text, minimum=0.0, name=f"max_{name}", zero_is_infinite=True)
 
 
 @dataclass(frozen=True, kw_only=True)

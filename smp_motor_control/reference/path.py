@@ -44,18 +44,18 @@ class ReferencePath:
         self._past.append((self._elapsed, self.now.velocity))
         return self.now
 
-    def delayed(self, delay: float, doubt: float, measurement: float) -> tuple[float, float]:
+    def delayed(self, delay: float, uncertainty: float, measurement: float) -> tuple[float, float]:
         """Return the reference ``delay`` seconds ago and the value to compare a measurement with.
 
-        The latter is the value within ``delay`` ± ``doubt`` that is closest to the measurement.
+        The latter is the reference closest to the measurement within ``delay`` ± ``uncertainty``.
         """
         past, time = self._past, self._elapsed - delay
-        while len(past) > 2 and past[1][0] <= time - doubt:
+        while len(past) > 2 and past[1][0] <= time - uncertainty:
             past.popleft()
         nominal = _interpolate(past, time)
-        if doubt == 0.0:
+        if uncertainty == 0.0:
             return nominal, nominal
-        possible = [nominal, *(_interpolate(past, time + x) for x in (-doubt, doubt))]
+        possible = [nominal, *(_interpolate(past, time + x) for x in (-uncertainty, uncertainty))]
         return nominal, min(max(measurement, min(possible)), max(possible))
 
     def acceleration_feedforward(

@@ -102,7 +102,7 @@ class WheelController:
         self._detector = FaultDetector(settings.faults)
         self.oscillation = Oscillation()
         self.configure(settings)
-        self._forget(-math.inf)
+        self._discard_state(-math.inf)
 
     # Settings ------------------------------------------------------------------------------
 
@@ -157,10 +157,10 @@ class WheelController:
 
     def reset(self, now: float) -> None:
         """Restart without faults, as an operator requests."""
-        self._forget(now)
+        self._discard_state(now)
         self.recovery.reset()
 
-    def _forget(self, now: float) -> None:
+    def _discard_state(self, now: float) -> None:
         self.setpoint: float | None = None  # [rad/s]
         self._setpoint_at = -math.inf
         self._feedback_at = now
@@ -191,7 +191,7 @@ class WheelController:
         self.answer = None
         verdict = self.clock.accept(stamp, arrival, now)
         if verdict is not _FRESH:
-            return self._not_fresh(verdict, now)
+            return self._handle_irregular_sample(verdict, now)
         velocity, voltage, dt = sample.velocity, sample.voltage, self.clock.dt
         limit = self.settings.implausible_velocity
         if not -limit <= velocity <= limit:
@@ -266,7 +266,7 @@ class WheelController:
         self.output = 0.0
         return 0.0
 
-    def _not_fresh(self, verdict: Verdict, now: float) -> float | None:
+    def _handle_irregular_sample(self, verdict: Verdict, now: float) -> float | None:
         if verdict is _FIRST:
             self.loop.reset_speed()
         elif verdict is _LATE:
@@ -300,11 +300,11 @@ class WheelController:
             self.oscillation.reset()
             self.output = 0.0
         evidence = dt if dt < _MAX_EVIDENCE_S else _MAX_EVIDENCE_S
-        stands = self._stop.asked and loop.reference.velocity == 0.0
+        stands = self._stop.is_zero and loop.reference.velocity == 0.0
         fault = detector.step(evidence, self.output, measurement, current, stands=stands)
         if fault is not None:
             return self._trip(fault, now)
-        if self._stop.asked:
+        if self._stop.is_zero:
             self._end_drive(evidence, measurement, now)
         out = loop.step(setpoint, measurement, dt)
         voltage = out.output

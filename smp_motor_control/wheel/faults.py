@@ -88,15 +88,15 @@ class FaultDetector:
         self.resistance = resistance
         # Of the wheel's model [V s/rad], [V]; NaN and 0 without a model
         self.volts_per_speed, self.static_voltage = math.nan, 0.0
-        self._learnt = math.nan  # volts per speed [V s/rad]
-        self._least = math.inf  # its minimum so far
+        self._learnt_ratio = math.nan  # volts per speed [V s/rad]
+        self._least_ratio = math.inf  # its minimum so far
         self.reset()
 
     def reset(self) -> None:
         """Discard all evidence."""
-        self._still = self._wrong = self._hot = 0.0
-        self._wrong_speed = 0.0
-        self._overloaded = 0.0
+        self._motionless_time = self._opposing_time = self._over_current_time = 0.0
+        self._opposing_speed = 0.0
+        self._overload_time = 0.0
         self.overload: tuple[float, float] | None = None  # actual and needed voltage [V]
         self._begin_window(math.nan)
 
@@ -106,18 +106,18 @@ class FaultDetector:
         """Return the fault shown by one more sample; ``stands``: the reference is zero."""
         limits = self.limits
         if limits.current_limit > 0.0 and abs(current) > limits.current_limit:
-            self._hot += dt
-            if self._hot >= limits.current_time:
+            self._over_current_time += dt
+            if self._over_current_time >= limits.current_time:
                 return Fault.OVER_CURRENT
         else:
-            self._hot = 0.0
+            self._over_current_time = 0.0
         driven = abs(voltage) >= limits.stall_voltage
         if driven and abs(velocity) < limits.stall_velocity:
-            self._still += dt
-            if self._still >= limits.stall_time > 0.0:
+            self._motionless_time += dt
+            if self._motionless_time >= limits.stall_time > 0.0:
                 return self._no_motion(voltage, current)
         else:
-            self._still = 0.0
+            self._motionless_time = 0.0
         # On a slope a wheel creeps until the voltage holds it.
         slowest = max(self.limits.stall_velocity, _MIN_ERROR if stands else 0.0)
         return self._runaway(dt, voltage, velocity, slowest)
@@ -127,13 +127,13 @@ class FaultDetector:
         limits = self.limits
         against = voltage * velocity < 0.0 and abs(velocity) >= slowest
         if not against or abs(voltage) < 0.5 * limits.stall_voltage:
-            self._wrong = 0.0
+            self._opposing_time = 0.0
             return None
-        if self._wrong == 0.0 or abs(velocity) < 0.8 * self._wrong_speed:
-            self._wrong = 0.0
-            self._wrong_speed = abs(velocity)
-        self._wrong += dt
-        return Fault.RUNAWAY if self._wrong >= limits.runaway_time > 0.0 else None
+        if self._opposing_time == 0.0 or abs(velocity) < 0.8 * self._opposing_speed:
+            self._opposing_time = 0.0
+            self._opposing_speed = abs(velocity)
+        self._opposing_time += dt
+        return Fault.RUNAWAY if self._opposing_time >= limits.runaway_time > 0.0 else None
 
     def _no_motion(self, voltage: float, current: float) -> Fault:
         if math.isnan(current) or math.isnan(self.resistance):
@@ -174,13 +174,13 @@ class FaultDetector:
             < _GOOD_TRACKING_SHARE * abs(speed)
             > _GOOD_TRACKING_SHARE * _MIN_ERROR
         ):
-            self._learnt = abs(self._voltage / self._speed)
-            self._least = min(self._least, self._learnt)
+            self._learnt_ratio = abs(self._voltage / self._speed)
+            self._least_ratio = min(self._least_ratio, self._learnt_ratio)
         self._judge_overload(abs(self._voltage) / elapsed, abs(speed), elapsed)
         error = abs(asked - speed)
         off = error > share * abs(asked) + _MIN_ERROR and self.limits.tracking_time > 0.0
         self._begin_window(speed if off else math.nan)
-        stalled = self._still > 0.0 and self.limits.stall_time > 0.0
+        stalled = self._motionless_time > 0.0 and self.limits.stall_time > 0.0
         way = abs(asked - before)  # NaN: the previous window was good
         if stalled or not (off and error > _MAX_REMAINING_SHARE * way):
             return None
@@ -188,20 +188,20 @@ class FaultDetector:
 
     def _judge_overload(self, voltage: float, speed: float, elapsed: float) -> None:
         """Compare a window's voltage with that needed by its speed, modelled or learnt."""
-        per_speed = self.volts_per_speed if self.volts_per_speed > 0.0 else self._least
+        per_speed = self.volts_per_speed if self.volts_per_speed > 0.0 else self._least_ratio
         needed = per_speed * speed + self.static_voltage if per_speed < math.inf else math.inf
         high = voltage > OVERLOAD_RATIO * needed + 0.75 * self.limits.stall_voltage
-        self._overloaded = self._overloaded + elapsed if high else 0.0
-        self.overload = (voltage, needed) if self._overloaded >= OVERLOAD_TIME_S else None
+        self._overload_time = self._overload_time + elapsed if high else 0.0
+        self.overload = (voltage, needed) if self._overload_time >= OVERLOAD_TIME_S else None
 
     def _reachable(self, voltage: float) -> float:
         """Return the steady speed at a voltage; infinite if unknown."""
         if self.volts_per_speed > 0.0:
             return max(voltage - self.static_voltage, 0.0) / self.volts_per_speed
-        return voltage / self._learnt if self._learnt > 0.0 else math.inf
+        return voltage / self._learnt_ratio if self._learnt_ratio > 0.0 else math.inf
 
 
-_NO_COUNT_FAULTS = (Fault.STALL, Fault.DEAD_ENCODER, Fault.NO_MOTION)
+_FAULTS_WITHOUT_COUNTS = (Fault.STALL, Fault.DEAD_ENCODER, Fault.NO_MOTION)
 
 
 class Recovery:
@@ -241,7 +241,7 @@ class Recovery:
             return False
         waited = now - self._since
         pause = self.first_pause * 2.0 ** (self.failures - 1)
-        alive = turns and self.fault in _NO_COUNT_FAULTS
+        alive = turns and self.fault in _FAULTS_WITHOUT_COUNTS
         rested = setpoint == 0.0 and waited > _RELEASE_TIME_S
         if alive or rested or (pause > 0.0 and waited > pause):
             self.fault = None

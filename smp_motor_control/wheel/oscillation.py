@@ -73,7 +73,7 @@ class Oscillation:
         self._halves: deque[tuple[float, float]] = deque(maxlen=HALF_SWINGS)  # instant, peak
         self._offset = self._before = self._older = 0.0
         self._xx = self._xy = self._yy = 0.0  # means of products of e(k-1) and e(k) + e(k-2)
-        self._side = self._time = self._turned_at = self._peak = self._way = 0.0
+        self._side = self._time = self._turned_at = self._peak = self._swept = 0.0
 
     def add(self, dt: float, reference: float, speed: float) -> None:
         """Add a sample."""
@@ -98,17 +98,17 @@ class Oscillation:
             self.found = None
             self._begin(reference)
         if error * self._side > 0.0:
-            self._way += abs(error) * dt
+            self._swept += abs(error) * dt
             self._peak = max(self._peak, abs(error))
 
     def _turn(self, side: float) -> None:
         """End a half period and check whether enough of them are consecutive."""
         halves = self._halves
-        if self._side and self._way < self.min_swing:
+        if self._side and self._swept < self.min_swing:
             halves.clear()
         elif self._side:
             halves.append((self._time, self._peak))
-        self._side, self._turned_at, self._peak, self._way = side, self._time, 0.0, 0.0
+        self._side, self._turned_at, self._peak, self._swept = side, self._time, 0.0, 0.0
         if len(halves) == HALF_SWINGS and self._time > MIN_DURATION_S:
             self.found = _find_cycle(halves) if self._is_regular() else None
 

@@ -31,7 +31,7 @@ class PlausibleSpeed:
     """Reject a reading that jumps, unless the next one confirms it or readings always jump."""
 
     def __init__(self) -> None:
-        self.gross = self.rate = math.inf  # plausible jump [rad/s] and acceleration [rad/s^2]
+        self.max_jump = self.rate = math.inf  # plausible jump [rad/s] and acceleration [rad/s^2]
         self._known = True
         self._usual = 0.0  # mean change, relative to the plausible one
         self._jump = self._inertia = self._load = self._back_emf = self._lag = 0.0
@@ -44,7 +44,7 @@ class PlausibleSpeed:
         """
         volts, inertia = gains.u_clamp_max, gains.feedforward_acceleration
         self._known = known = drive is not None and inertia > 0.0 and math.isfinite(volts)
-        self.gross = (
+        self.max_jump = (
             _DEFAULT_JUMP_SHARE * drive.top_speed if drive is not None and known else math.inf
         )
         # Full reverse voltage at full speed.
@@ -64,7 +64,7 @@ class PlausibleSpeed:
             kept = self._kept if self._kept == self._kept else 0.0
             return _UNKNOWN_MOTOR_JUMP + _UNKNOWN_MOTOR_SHARE * max(abs(kept), abs(asked)) + count
         if not self._jump:
-            return max(self.gross, self.rate * dt) + count
+            return max(self.max_jump, self.rate * dt) + count
         drive = abs(voltage - self._back_emf * self._kept) + self._load
         faded = self._drive + dt / (2.0 * (self._lag + dt)) * (drive - self._drive)
         self._drive = drive if not drive < faded else faded  # NaN: first reading

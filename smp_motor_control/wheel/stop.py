@@ -32,7 +32,7 @@ class StopRule:
         self._time = self._turned = self._volt_seconds = 0.0
 
     @property
-    def asked(self) -> bool:
+    def is_zero(self) -> bool:
         """Whether the set-point is zero."""
         return self._since < math.inf
 

@@ -11,11 +11,17 @@ from smp_motor_control.wheel.protection import Bounds
 from smp_motor_ident.bag.read import convert_description
 from smp_motor_ident.commission import wheel_test as judged
 from smp_motor_ident.commission.wheel_checks import Robot, judge
-from smp_motor_ident.commission.wheel_test import Figures, Phase, Trace, answers_well, has_settled
+from smp_motor_ident.commission.wheel_test import (
+    Figures,
+    Phase,
+    Trace,
+    has_settled,
+    responds_clearly,
+)
 from smp_motor_ident.finding import Finding
 from smp_motor_ident.record import Hardware
 
-REST, COAST = 0.3, 0.4  # zero voltage before and after [s]; a coast of a few time constants
+REST_S, COAST_S = 0.3, 0.4  # zero voltage before and after [s]; a coast of a few time constants
 MAX_HOLD_S = 2.0  # a voltage is held for so long where the wheel is slow [s]
 RAMP_RATE = 0.15  # growth of the voltage until the wheel turns [of the supply per second]
 LEVEL_RATIO = 2.0  # of the voltage from one level to the next
@@ -23,11 +29,11 @@ FIRST_LEVEL = (1.5, 0.05)
 """First level: multiple of the starting voltage, plus a share of the supply."""
 
 TIMEOUT_S = 5.0  # longest wait for descriptions [s]
-TURNED_COUNTS = 12.0  # counts after which a ramp ends: the wheel turns
+TURNING_COUNTS = 12.0  # counts after which a ramp ends: the wheel turns
 
 
 @dataclass(frozen=True)
-class Checked:
+class CheckResult:
     """Result of the wheel checks."""
 
     findings: tuple[Finding, ...]  # in the order of the checks
@@ -37,7 +43,7 @@ class Checked:
 
 
 @dataclass
-class _Way:
+class _WheelUnderTest:
     """A wheel under test: its driving process and its completed phases."""
 
     test: Any
@@ -55,28 +61,28 @@ class _Way:
 
     def test_direction(self, sign: float) -> None:
         """Ramp until it turns, then hold growing levels until it answers well, then coast."""
-        tape = self.test.tapes[self.wheel]
+        tape = self.test.recordings[self.wheel]
         rate, first = RAMP_RATE * self.supply, len(tape.rows)
         start = self.phase(
             "ramp",
             lambda t: sign * min(rate * t, self.limit),
             self.limit / rate,
-            lambda: tape.turned(first) >= TURNED_COUNTS,
+            lambda: tape.turned(first) >= TURNING_COUNTS,
         )
         # Two levels at least tell friction from gain.
         level = FIRST_LEVEL[0] * abs(start) + FIRST_LEVEL[1] * self.supply
         level = min(level, 0.5 * (abs(start) + self.limit))
-        while tape.turned(first) >= TURNED_COUNTS:
+        while tape.turned(first) >= TURNING_COUNTS:
             before = len(tape.rows)
             self._hold(sign * level)
-            if level >= self.limit or answers_well(level, abs(start), tape.turned(before)):
+            if level >= self.limit or responds_clearly(level, abs(start), tape.turned(before)):
                 break
             level = min(LEVEL_RATIO * level, self.limit)
-        self.phase("coast", lambda t: 0.0, COAST, None)
+        self.phase("coast", lambda t: 0.0, COAST_S, None)
 
     def _hold(self, voltage: float) -> None:
         """Hold a voltage until the wheel has has_settled."""
-        rows = self.test.tapes[self.wheel].rows
+        rows = self.test.recordings[self.wheel].rows
         since = len(rows)
         self.phase(
             "hold", lambda t: voltage, MAX_HOLD_S, lambda: has_settled(Trace.of(rows[since:]))
@@ -90,7 +96,7 @@ def check_wheels(
     bounds: Bounds,
     known: Mapping[str, MotorEntry],
     say: Callable[[str], None],
-) -> Checked:
+) -> CheckResult:
     """Test the wheels one by one, at most at ``limit`` volts, and check their responses."""
     from smp_motor_control.nodes import wheel_test
 
@@ -103,12 +109,12 @@ def check_wheels(
     with wheel_test.WheelTest(client, counters, bounds).open() as test:
         for wheel in wheels:
             say(wheel)
-            way = _Way(test, wheel, hardware[wheel].supply_voltage or 12.0, limit)
-            way.phase("rest", lambda t: 0.0, REST, None)
+            way = _WheelUnderTest(test, wheel, hardware[wheel].supply_voltage or 12.0, limit)
+            way.phase("rest", lambda t: 0.0, REST_S, None)
             way.test_direction(1.0)
             way.test_direction(-1.0)
             phases += way.phases
-    traces = {wheel: Trace.of(tape.rows) for wheel, tape in test.tapes.items()}
+    traces = {wheel: Trace.of(tape.rows) for wheel, tape in test.recordings.items()}
     found = {
         wheel: judged.figures(
             traces[wheel], [p for p in phases if p.wheel == wheel], hardware[wheel]
@@ -122,10 +128,10 @@ def check_wheels(
         {w: known[w].parameters.dc_gain for w in wheels if w in known},
         {w: known[w].gearbox.ratio for w in wheels if w in known},
         wheel_test.read_battery(client),
-        {wheel: tape.position_problem() for wheel, tape in test.tapes.items()},
+        {wheel: tape.position_problem() for wheel, tape in test.recordings.items()},
     )
     levels = [one.level for one in found.values() if math.isfinite(one.level)]
     amplitude = max(levels, default=limit)
     speeds = [abs(found[w].gain) * amplitude / hardware[w].gear_ratio for w in wheels]
     fastest = max(filter(math.isfinite, speeds), default=math.nan)
-    return Checked(tuple(judge(robot)), found, amplitude, fastest)
+    return CheckResult(tuple(judge(robot)), found, amplitude, fastest)

@@ -18,9 +18,9 @@ from smp_motor_control import WHEELS
 from smp_motor_control.motor.file import load_motors
 from smp_motor_control.wheel.protection import Bounds
 from smp_motor_ident.bag.read import read_experiments
-from smp_motor_ident.cli import checking, commission, driving, plan, protocol, steps
+from smp_motor_ident.cli import checking, commission, commissioning_log, driving, plan, steps
+from smp_motor_ident.cli.commissioning_log import CommissioningLog
 from smp_motor_ident.cli.processes import ProcessError, Processes, connect
-from smp_motor_ident.cli.protocol import Protocol
 from smp_motor_ident.commission import validation_run, winding
 from smp_motor_ident.errors import ParameterError
 from smp_motor_ident.finding import Finding
@@ -32,10 +32,10 @@ from smp_motor_ident.result import Estimate
 AMPLITUDE, DURATION = 6.0, 15.0
 """Largest voltage [V] and length of a signal [s], unless the user or an earlier run says so."""
 
-DRAFT = "recording"  # folder of a recording until it is whole
+UNFINISHED = "recording"  # folder of a recording until it is whole
 DISCOVERY_S = 2.0  # a controller that runs is discovered by then [s]
 REPORT_TIMEOUT_S = 15.0  # of the first states of all wheels
-LOOKS, ALIKE = 15, 4
+MAX_SEARCHES, EQUAL_SEARCHES = 15, 4
 """Largest number of searches for wheels [1 s each], and equal results in a row that end them."""
 
 UNRELIABLE = "unreliable_identification"
@@ -51,7 +51,7 @@ class Session:
 
     arguments: argparse.Namespace
     robot: steps.Robot
-    protocol: Protocol
+    log: CommissioningLog
     schedule: plan.Schedule
 
     def begin(self, part: str, how: str = "") -> None:
@@ -61,9 +61,9 @@ class Session:
 
 def work(arguments: argparse.Namespace) -> int:
     """Run the command and return its exit code."""
-    folder = _checked(arguments)
+    folder = _prepare_folder(arguments)
     known = load_motors(arguments.motors) if arguments.motors else {}
-    begun = Protocol(folder, arguments.accept)
+    begun = CommissioningLog(folder, arguments.accept)
     # What the arguments leave open is as in the run that is resumed, else the defaults.
     earlier = begun.document.get("asked", {})
     arguments.wheel = arguments.wheel or earlier.get("wheels")
@@ -76,7 +76,7 @@ def work(arguments: argparse.Namespace) -> int:
     try:
         return _commission(arguments, folder, known)
     finally:
-        if folder.is_dir() and not (folder / protocol.NAME).exists():
+        if folder.is_dir() and not (folder / commissioning_log.NAME).exists():
             shutil.rmtree(folder)  # it has only logs, the wheels never moved
 
 
@@ -93,12 +93,12 @@ def _commission(arguments: argparse.Namespace, folder: Path, known: Mapping[str,
         session = _begin(arguments, robot)
         if session is None:
             return 0
-        with client.paused(robot.wheels), session.protocol.ending():
+        with client.paused(robot.wheels), session.log.ending():
             _move(session, known)
             designed = _design(session)
             verdict = _verify(session, designed)
-    session.protocol.end(True, verdict)
-    print("\n".join(session.protocol.summary()))
+    session.log.end(True, verdict)
+    print("\n".join(session.log.summary()))
     print(f"{verdict}\nreport: {folder / 'report.html'}")
     if not arguments.apply:
         results = folder / "identification"
@@ -108,7 +108,7 @@ def _commission(arguments: argparse.Namespace, folder: Path, known: Mapping[str,
 
 def _begin(arguments: argparse.Namespace, robot: steps.Robot) -> Session | None:
     """Ask before anything moves; discard results at other voltages or of other wheels."""
-    made = Protocol(robot.folder, arguments.accept)
+    made = CommissioningLog(robot.folder, arguments.accept)
     asked = {name: getattr(arguments, name) for name in ("amplitude", "duration")}
     asked["wheels"] = list(robot.wheels)
     same = made.document.get("asked") == asked
@@ -119,13 +119,13 @@ def _begin(arguments: argparse.Namespace, robot: steps.Robot) -> Session | None:
         if "asked" in made.document:
             _say("wheels, amplitude or duration have changed: all steps are repeated")
         made.begin(robot.wheels, asked)
-    left = [one for one in _recordings(arguments, made) if not (same and _is_kept(robot, one))]
+    left = [one for one in _recordings(arguments, made) if not (same and _is_recorded(robot, one))]
     if left:
         made.mark(identified=False, judged=False, tuned=False)
     parts = {part: made.has(part) for part in ("checked", "identified", "tuned")}
     schedule = plan.schedule(robot.wheels, left, **parts)
     session = Session(arguments, robot, made, schedule)
-    _tell_controllers(arguments, robot)
+    _report_missing_controllers(arguments, robot)
     _confirm(arguments, robot.wheels, left, schedule)
     if not same:
         for name in (plan.FITTED, plan.HELD_OUT):
@@ -134,7 +134,7 @@ def _begin(arguments: argparse.Namespace, robot: steps.Robot) -> Session | None:
     return session
 
 
-def _tell_controllers(arguments: argparse.Namespace, robot: steps.Robot) -> None:
+def _report_missing_controllers(arguments: argparse.Namespace, robot: steps.Robot) -> None:
     """Report wheels without a controller, for which one is started for the drive."""
     robot.client.until(lambda: not robot.uncontrolled(), DISCOVERY_S)
     missing = ", ".join(robot.uncontrolled())
@@ -147,29 +147,29 @@ def _tell_controllers(arguments: argparse.Namespace, robot: steps.Robot) -> None
         _say(f"no wheel_pid runs for {missing}: one is started for the drive and ended after it")
 
 
-def _recordings(arguments: argparse.Namespace, made: Protocol) -> list[plan.Recording]:
+def _recordings(arguments: argparse.Namespace, made: CommissioningLog) -> list[plan.Recording]:
     """Return the recordings at the voltage that the checks found, or before them at the largest."""
     amplitude = made.document["amplitude"] if made.has("checked") else arguments.amplitude
     return plan.recordings(amplitude, arguments.duration)
 
 
-def _is_kept(robot: steps.Robot, one: plan.Recording) -> bool:
+def _is_recorded(robot: steps.Robot, one: plan.Recording) -> bool:
     return (robot.folder / one.folder / one.name).is_dir()
 
 
 def _move(session: Session, known: Mapping[str, Any]) -> None:
     """Check the wheels, then record them under excitation; skip completed steps."""
-    arguments, made = session.arguments, session.protocol
+    arguments, made = session.arguments, session.log
     if not made.has("checked"):
         _check(session, known)
     for one in _recordings(arguments, made):
-        if not _is_kept(session.robot, one):
+        if not _is_recorded(session.robot, one):
             _record(session, one)
 
 
 def _check(session: Session, known: Mapping[str, Any]) -> None:
     """Check the wheels one by one; stop at faults that the user must repair."""
-    arguments, robot, made = session.arguments, session.robot, session.protocol
+    arguments, robot, made = session.arguments, session.robot, session.log
     bounds = Bounds(speed=arguments.max_speed or 0.0, current=arguments.max_current)
     checked = checking.check_wheels(
         robot.client, robot.wheels, arguments.amplitude, bounds, known,
@@ -185,28 +185,30 @@ def _record(session: Session, one: plan.Recording) -> None:
     """Record the wheels under one signal; stop them at the end in any case."""
     arguments, robot = session.arguments, session.robot
     robot.client.wait_for_wheels(robot.wheels, REPORT_TIMEOUT_S)
-    speed = session.protocol.document.get("speed")
+    speed = session.log.document.get("speed")
     if speed and not arguments.max_speed:
         fastest = MAX_SPEED_RATIO * float(speed)
         robot = replace(robot, bounds={**robot.bounds, "max_speed": fastest})
     session.begin(one.part, one.describe())
-    draft = robot.folder / DRAFT
+    draft = robot.folder / UNFINISHED
     shutil.rmtree(draft, ignore_errors=True)
     try:
-        steps.record(robot, DRAFT)
+        steps.record(robot, UNFINISHED)
         steps.excite(robot, [one.excitation])
     finally:
         robot.processes.stop("excite", "record")
-    made = session.protocol
+    made = session.log
     made.mark(identified=False, judged=False, tuned=False)
     made.write()
     (robot.folder / one.folder).mkdir(exist_ok=True)
     draft.rename(robot.folder / one.folder / one.name)
-    earlier = [r for r in _recordings(arguments, made) if r != one and _is_kept(robot, r)]
-    made.stop(made.add(one.part, too_hot(robot.folder, earlier, one)))
+    earlier = [r for r in _recordings(arguments, made) if r != one and _is_recorded(robot, r)]
+    made.stop(made.add(one.part, find_hot_windings(robot.folder, earlier, one)))
 
 
-def too_hot(folder: Path, earlier: Sequence[plan.Recording], last: plan.Recording) -> list[Finding]:
+def find_hot_windings(
+    folder: Path, earlier: Sequence[plan.Recording], last: plan.Recording
+) -> list[Finding]:
     """Return which windings must cool before the next signal."""
     before, now = (
         read_experiments([str(folder / r.folder / r.name) for r in some]) if some else {}
@@ -220,20 +222,20 @@ def too_hot(folder: Path, earlier: Sequence[plan.Recording], last: plan.Recordin
     ]
 
 
-def _design(session: Session) -> driving.Designed:
+def _design(session: Session) -> driving.DesignSet:
     """Identify and tune, skipping completed steps; write each result in one piece."""
-    arguments, robot, made = session.arguments, session.robot, session.protocol
+    arguments, robot, made = session.arguments, session.robot, session.log
     folder, gains = robot.folder, robot.folder / "gains.yaml"
-    known = (folder / plan.FITTED / plan.FURTHER).is_dir()
+    known = (folder / plan.FITTED / plan.EXTRA).is_dir()
     estimates = _identify(session, plan.IDENTIFYING)
-    more = None if known else plan.plan_further(estimates, arguments.amplitude)
+    more = None if known else plan.plan_extra_recording(estimates, arguments.amplitude)
     if more:
-        session.schedule.add(more.part, "signal", more.excitation.duration + plan.START)
-        session.schedule.add(plan.AGAIN, "identify", plan.COMPUTE * len(robot.wheels))
+        session.schedule.add(more.part, "signal", more.excitation.duration + plan.START_S)
+        session.schedule.add(plan.IDENTIFYING_AGAIN, "identify", plan.COMPUTE_S * len(robot.wheels))
         _record(session, more)
-        estimates = _identify(session, plan.AGAIN)
+        estimates = _identify(session, plan.IDENTIFYING_AGAIN)
     if not made.has("judged"):
-        made.add("identification", unreliable(estimates))
+        made.add("identification", report_unreliable_motors(estimates))
         made.add(
             "validation", validate_motors(estimates, folder / plan.FITTED, folder / plan.HELD_OUT)
         )
@@ -251,7 +253,7 @@ def _design(session: Session) -> driving.Designed:
 
 def _identify(session: Session, part: str) -> dict[str, Estimate]:
     """Identify from all recordings, unless that is done."""
-    robot, made = session.robot, session.protocol
+    robot, made = session.robot, session.log
     results = robot.folder / "identification"
     if made.has("identified"):
         return read_identification(results)
@@ -263,19 +265,21 @@ def _identify(session: Session, part: str) -> dict[str, Estimate]:
         estimates = steps.identify_wheels(robot.folder / plan.FITTED, results, *options)
     except ProcessError:
         if (results / "identification.json").is_file():
-            made.stop(made.add("identification", unreliable(read_identification(results))))
+            made.stop(
+                made.add("identification", report_unreliable_motors(read_identification(results)))
+            )
         raise
     made.mark(identified=True, judged=False, tuned=False)
     made.write()
     return estimates
 
 
-def _verify(session: Session, designed: driving.Designed) -> str:
+def _verify(session: Session, designed: driving.DesignSet) -> str:
     """Drive with the gains on trial, check the drive, and return the outcome."""
-    robot, made = session.robot, session.protocol
+    robot, made = session.robot, session.log
     robot.client.wait_for_wheels(robot.wheels, REPORT_TIMEOUT_S)
     session.schedule.add(
-        plan.DRIVING, "drive", plan.START + sum(one[2] for one in driving.plan_of(designed))
+        plan.DRIVING, "drive", plan.START_S + sum(one[2] for one in driving.plan_drive(designed))
     )
     session.begin(plan.DRIVING)
     own = robot.uncontrolled()
@@ -304,14 +308,14 @@ def _verify(session: Session, designed: driving.Designed) -> str:
 def find_wheels(client: Any) -> tuple[str, ...]:
     """Return the wheels that report; on a busy machine they are discovered seconds apart."""
     looks: list[tuple[str, ...]] = []
-    while len(looks) < LOOKS:
+    while len(looks) < MAX_SEARCHES:
         looks.append(tuple(client.find_wheels()))
-        if looks[-1] and looks[-ALIKE:] == [looks[-1]] * ALIKE:
+        if looks[-1] and looks[-EQUAL_SEARCHES:] == [looks[-1]] * EQUAL_SEARCHES:
             break
     return looks[-1]
 
 
-def unreliable(estimates: Mapping[str, Estimate]) -> list[Finding]:
+def report_unreliable_motors(estimates: Mapping[str, Estimate]) -> list[Finding]:
     """Return the reasons against a design on the identified motors."""
     return [
         Finding(UNRELIABLE, "refused", f"{wheel}: {one.message}", one.evidence, one.advice)
@@ -329,14 +333,14 @@ def validate_motors(
     read = {path: read_experiments([str(path)]) for path in (fitted, held_out)}
     for wheel, one in estimates.items():
         parts = [
-            [validation_run.Simulated(r.time, *simulate(one, r)) for r in read[path][wheel]]
+            [validation_run.SimulatedRun(r.time, *simulate(one, r)) for r in read[path][wheel]]
             for path in (fitted, held_out)
         ]
         found.append(validation_run.judge(wheel, *parts))
     return found
 
 
-def _checked(arguments: argparse.Namespace) -> Path:
+def _prepare_folder(arguments: argparse.Namespace) -> Path:
     """Return the folder, or refuse before anything starts."""
     folder = Path(arguments.output)
     there = {path.name for path in folder.iterdir()} if folder.is_dir() else {folder.name}
@@ -346,7 +350,7 @@ def _checked(arguments: argparse.Namespace) -> Path:
         raise ParameterError(
             f"{folder}: exists already; choose another --output, or go on there with --resume"
         )
-    if arguments.resume and protocol.NAME not in there:
+    if arguments.resume and commissioning_log.NAME not in there:
         raise ParameterError(f"{folder}: holds no interrupted commissioning; leave out --resume")
     return folder
 

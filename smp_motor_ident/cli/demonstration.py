@@ -50,20 +50,20 @@ def work(arguments: argparse.Namespace) -> int:
 
     motors = Path(arguments.motors) if arguments.motors else find_config(PAPER_MOTORS)
     truth = load_motors(motors, WHEELS)
-    folder = _fresh(Path(arguments.output))
+    folder = _clear_folder(Path(arguments.output))
     domain = free_domain() if arguments.domain is None else arguments.domain
     os.environ.update({"ROS_DOMAIN_ID": str(domain), **loopback.loopback_environment()})
     with Processes(folder / "logs") as processes, connect(demo.NAME) as client:
         robot = steps.Robot(processes, client, WHEELS, folder)
         start(robot, motors, arguments.rate)
         say(f"running: motor_plant, {len(WHEELS)} wheel_pid, skid_steer (ROS domain {domain})")
-        designed = learn(robot, say)
+        designed = identify_and_tune(robot, say)
         driven, segments, stall = drive(robot, designed.gains, say)
     hardware = {wheel: designed.estimates[wheel].hardware for wheel in WHEELS}
-    figure = driving.drive_figure(driven, {"left": LEFT, "right": RIGHT}, hardware)
+    figure = driving.draw_drive(driven, {"left": LEFT, "right": RIGHT}, hardware)
     (folder / "drive.svg").write_text(figure, encoding="utf-8")
     changes = {
-        w: driving.changes_of(w, one, driving.find_moves(segments, one.answers), designed)[0]
+        w: driving.evaluate_changes(w, one, driving.find_moves(segments, one.answers), designed)[0]
         for w, one in driven.items()
     }
     verdict.show(truth, designed, changes)
@@ -80,7 +80,7 @@ def work(arguments: argparse.Namespace) -> int:
     return 0 if all(one.holds for one in checks) else 1
 
 
-def _fresh(folder: Path) -> Path:
+def _clear_folder(folder: Path) -> Path:
     """Return an empty folder; an earlier demo's is emptied, anything else is left alone."""
     if folder.exists():
         if not (folder / "logs").is_dir():
@@ -100,14 +100,14 @@ def start(robot: steps.Robot, motors: Path, rate: float) -> None:
     client.wait_for_wheels(robot.wheels, timeout=steps.TIMEOUT_S)
 
 
-def learn(robot: steps.Robot, say: Any) -> driving.Designed:
+def identify_and_tune(robot: steps.Robot, say: Any) -> driving.DesignSet:
     """Excite, record, identify and tune."""
     bag = steps.record(robot, "excitation")
     for part in PLAN:
         say(f"exciting all wheels: {part.signal}, {part.amplitude:g} V, {part.duration:g} s")
         steps.excite(robot, [part])
     robot.processes.stop("record")
-    takes = plan.format_duration(plan.COMPUTE * len(robot.wheels))
+    takes = plan.format_duration(plan.COMPUTE_S * len(robot.wheels))
     say(f"recorded {bag}; identifying, which takes about {takes}")
     results = robot.folder / "identification"
     estimates = steps.identify_wheels(bag, results, "--quiet")
@@ -119,7 +119,7 @@ def learn(robot: steps.Robot, say: Any) -> driving.Designed:
 
 def drive(
     robot: steps.Robot, gains: Mapping[str, Mapping[str, Any]], say: Any
-) -> tuple[dict[str, driving.Driven], list[tuple[str, float, float]], float]:
+) -> tuple[dict[str, driving.DriveRecording], list[tuple[str, float, float]], float]:
     """Drive through :data:`DRIVE` with the gains; return recording, segments and stall [s]."""
     from smp_motor_control.nodes.driving import drive_body
 
@@ -134,7 +134,7 @@ def drive(
         segments = drive_body(robot.client, DRIVE, robot.wheels)
         robot.processes.stop("record")
         read = driving.read_drive(bag, robot.wheels)
-        stall = driving.longest_stall(read)
+        stall = driving.find_longest_stall(read)
         drives.append((stall, name, read, segments))
         if stall <= MAX_STALL_S:
             break

@@ -29,14 +29,14 @@ from smp_motor_ident.tune.verification import STEADY_TIME_S, Change
 MIN_CHANGE = 0.8  # a smaller change of the set-point [rad/s, wheel] is no step to judge
 LEAD_S = 0.3  # rest before a drive that is simulated with it [s]
 MAX_SAMPLES = 1e6  # of a drive, which takes seconds
-STATE = ("encoder_count", "position", "voltage")
-ANSWER = ("setpoint", "age", "dt", "output")
+STATE_COLUMNS = ("encoder_count", "position", "voltage")
+ANSWER_COLUMNS = ("setpoint", "age", "dt", "output")
 MIN_STEP_S = 1.0  # of a change of set-point with its end [s]
 MAX_ATTEMPTS = 3  # largest number of drives; a disturbed drive is repeated
 
 
 @dataclass(frozen=True)
-class Designed:
+class DesignSet:
     """Designs, predictions and limits that a drive is compared with, by wheel."""
 
     estimates: Mapping[str, Estimate]  # the motors
@@ -44,14 +44,14 @@ class Designed:
     document: Mapping[str, Mapping[str, Any]]  # as in ``gains.json``
 
 
-def read_designs(estimates: Mapping[str, Estimate], gains: Path) -> Designed:
+def read_designs(estimates: Mapping[str, Estimate], gains: Path) -> DesignSet:
     """Return motors with the gains that ``tune`` wrote for them, a YAML file and its JSON."""
     document = json.loads(gains.with_suffix(".json").read_text("utf-8"))["wheels"]
-    return Designed(estimates, applying.from_file(gains), document)
+    return DesignSet(estimates, applying.from_file(gains), document)
 
 
 @dataclass(frozen=True)
-class Driven:
+class DriveRecording:
     """Recorded samples of one wheel and the commands of its controller."""
 
     state: Table
@@ -69,13 +69,13 @@ class Move:
     lasts: float  # [s]
 
 
-def read_drive(bag: Path, wheels: Sequence[str], namespace: str = "") -> dict[str, Driven]:
+def read_drive(bag: Path, wheels: Sequence[str], namespace: str = "") -> dict[str, DriveRecording]:
     """Read the samples of wheels and the answers of their controllers."""
-    wanted = {f"{namespace}/{wheel}/motor_state": list(STATE) for wheel in wheels}
-    wanted |= {f"{namespace}/{wheel}/pid_state": list(ANSWER) for wheel in wheels}
+    wanted = {f"{namespace}/{wheel}/motor_state": list(STATE_COLUMNS) for wheel in wheels}
+    wanted |= {f"{namespace}/{wheel}/pid_state": list(ANSWER_COLUMNS) for wheel in wheels}
     read = read_columns(bag, wanted)
     return {
-        w: Driven(read[f"{namespace}/{w}/motor_state"], read[f"{namespace}/{w}/pid_state"])
+        w: DriveRecording(read[f"{namespace}/{w}/motor_state"], read[f"{namespace}/{w}/pid_state"])
         for w in wheels
     }
 
@@ -97,8 +97,8 @@ def find_moves(segments: Sequence[tuple[str, float, float]], answers: Table) -> 
     return moves
 
 
-def changes_of(
-    wheel: str, driven: Driven, moves: Sequence[Move], given: Designed
+def evaluate_changes(
+    wheel: str, driven: DriveRecording, moves: Sequence[Move], given: DesignSet
 ) -> tuple[list[Change], float]:
     """Return the changes of one wheel, and its longest wait for an answer [s]."""
     state, answers = driven.state, driven.answers
@@ -128,7 +128,7 @@ def changes_of(
             "clocks and the nodes, then drive again"
         )
     even, speed = verification.smooth_speed(
-        instants, wheel_angle(state, estimate.hardware)[shown], step
+        instants, compute_wheel_angle(state, estimate.hardware)[shown], step
     )
     rows = verification.predict_speed(
         estimate, given.gains[wheel], entry["loop"], asked, (instants, waited), even
@@ -147,8 +147,8 @@ def changes_of(
     return changes, silence
 
 
-def drive_figure(
-    drive: Mapping[str, Driven],
+def draw_drive(
+    drive: Mapping[str, DriveRecording],
     sides: Mapping[str, Sequence[str]],
     hardware: Mapping[str, Hardware],
 ) -> str:
@@ -159,7 +159,7 @@ def drive_figure(
     for side, names in sides.items():
         asked = drive[names[0]].answers
         time = asked.seconds
-        speeds = {w: wheel_speed(drive[w].state, hardware[w]) for w in names}
+        speeds = {w: compute_wheel_speed(drive[w].state, hardware[w]) for w in names}
         curves = [Curve("set-point", asked.columns["setpoint"], "muted")]
         curves += [
             Curve(w, np.interp(time, *speeds[w]), f"wheel-{wheels.index(w) % 4 + 1}") for w in names
@@ -172,14 +172,14 @@ def drive_figure(
     return document(charts, wheels)
 
 
-def longest_stall(drive: Mapping[str, Driven]) -> float:
+def find_longest_stall(drive: Mapping[str, DriveRecording]) -> float:
     """Return the longest pause of the simulating machine [s]."""
     gaps = (float(np.max(np.diff(one.state.seconds))) for one in drive.values())
     ages = (float(np.max(one.answers.columns["age"])) for one in drive.values())
     return max(*gaps, *ages)
 
 
-def wheel_angle(state: Table, hardware: Hardware) -> Array:
+def compute_wheel_angle(state: Table, hardware: Hardware) -> Array:
     """Return the wheel's angle from counts, if there are any."""
     if not hardware.counts_per_revolution:
         return state.columns["position"]
@@ -188,14 +188,14 @@ def wheel_angle(state: Table, hardware: Hardware) -> Array:
     return Gearbox(hardware.gear_ratio).to_wheel(turn) * counts
 
 
-def wheel_speed(state: Table, hardware: Hardware) -> tuple[Array, Array]:
+def compute_wheel_speed(state: Table, hardware: Hardware) -> tuple[Array, Array]:
     """Return the wheel's speed as its encoder saw it."""
-    angle = wheel_angle(state, hardware)
+    angle = compute_wheel_angle(state, hardware)
     step = float(np.median(np.diff(state.seconds)))
     return verification.smooth_speed(state.seconds, angle - angle[0], step)
 
 
-class NeverHeard(ProcessError):
+class NoMessageError(ProcessError):
     """A wheel's controller published nothing at a set-point of the drive."""
 
 
@@ -222,7 +222,7 @@ def on_trial(client: Any, gains: Mapping[str, Mapping[str, Any]]) -> Iterator[Tr
         client.set_pending_restore(**pending_restore)
 
 
-def plan_of(designed: Designed) -> list[tuple[str, float, float]]:
+def plan_drive(designed: DesignSet) -> list[tuple[str, float, float]]:
     """Return the steps of the drive: name, set-point [rad/s] and duration [s]."""
     specified = [one["specification"] for one in designed.document.values()]
     change = min(float(one["change"]) for one in specified)
@@ -249,15 +249,15 @@ def drive(robot: steps.Robot, plan: Sequence[tuple[str, float, float]]) -> Path:
 
 
 def drive_undisturbed(
-    robot: steps.Robot, designed: Designed, say: Callable[[str], None]
+    robot: steps.Robot, designed: DesignSet, say: Callable[[str], None]
 ) -> tuple[list[Change], list[Finding]]:
     """Repeat a drive until it is undisturbed; return the changes and the findings."""
-    plan, namespace = plan_of(designed), str(robot.client.node.get_namespace()).rstrip("/")
+    plan, namespace = plan_drive(designed), str(robot.client.node.get_namespace()).rstrip("/")
     for left in reversed(range(MAX_ATTEMPTS)):
         say(f"driving on the new gains: {', '.join(name for name, *_ in plan)}")
         try:
             changes, silence = read_changes(drive(robot, plan), plan, designed, namespace)
-        except NeverHeard as error:
+        except NoMessageError as error:
             if not left:
                 raise
             say(f"the drive was disturbed: {error}")
@@ -271,7 +271,7 @@ def drive_undisturbed(
 
 
 def read_changes(
-    bag: Path, plan: Sequence[tuple[str, float, float]], designed: Designed, namespace: str
+    bag: Path, plan: Sequence[tuple[str, float, float]], designed: DesignSet, namespace: str
 ) -> tuple[list[Change], float]:
     """Return every change from rest, and the longest wait of a wheel for an answer [s]."""
     changes, silence = list[Change](), 0.0
@@ -281,7 +281,7 @@ def read_changes(
             for name, setpoint, lasts in plan
             if setpoint
         ]
-        found, waited = changes_of(wheel, driven, moves, designed)
+        found, waited = evaluate_changes(wheel, driven, moves, designed)
         changes += found
         silence = max(silence, waited)
     return changes, silence
@@ -291,7 +291,7 @@ def _begin(wheel: str, setpoint: float, answers: Table) -> float:
     """Return the time of a wheel's first message at a set-point."""
     asked = np.flatnonzero(np.isclose(answers.columns["setpoint"], setpoint))
     if not asked.size:
-        raise NeverHeard(
+        raise NoMessageError(
             f"{wheel}: wheel_pid published nothing at {setpoint:.3g} rad/s in the drive: it had a "
             "fault, or its messages were lost; check /diagnostics, then continue with --resume"
         )

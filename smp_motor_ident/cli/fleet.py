@@ -30,7 +30,7 @@ from smp_motor_ident.report import fleet, words
 from smp_motor_ident.report.document import check_free, write_together
 from smp_motor_ident.result import plain
 
-MAX_TRIES = 2  # largest number of tries for a recording that kills its worker
+MAX_ATTEMPTS = 2  # largest number of tries for a recording that kills its worker
 
 Results = Iterator[tuple[str, list[fleet.Row]]]
 """Paths of recordings, each with its rows."""
@@ -46,14 +46,14 @@ def work(
     done = folder / "done"
     done.mkdir(parents=True, exist_ok=True)
     options = json.dumps([repr(mapping), arguments.model, sorted(arguments.fix)])
-    files = {path: done / f"{_key(Path(path), options)}.json" for path in arguments.bags}
+    files = {path: done / f"{_hash_inputs(Path(path), options)}.json" for path in arguments.bags}
     left = [path for path, file in files.items() if not file.exists()]
     if not arguments.quiet:
         print(f"{len(files) - len(left)} of {len(files)} recordings are known already")
     decode = msgspec.json.Decoder(list[fleet.Row]).decode
     results = {p: decode(f.read_bytes()) for p, f in files.items() if f.exists()}
     settings = (mapping, arguments.model, dict(fixed))
-    for path, found in _results(left, settings, arguments.scheduler):
+    for path, found in _identify_all(left, settings, arguments.scheduler):
         results[path] = found
         if not any(row.lost for row in found):
             write_together({files[path]: msgspec.json.encode(plain(found))}, force=True)
@@ -75,7 +75,7 @@ def work(
     return int(any(row.failure or row.unreliable for row in rows))
 
 
-def _key(path: Path, options: str) -> str:
+def _hash_inputs(path: Path, options: str) -> str:
     """Return the key of a result: a hash of all that it depends on."""
     if not path.exists():
         raise BagError(f"{path}: no such file or folder")
@@ -97,31 +97,33 @@ def identify_one(path: str, settings: tuple[Any, ...]) -> list[fleet.Row]:
             try:
                 found = estimate(select_excerpts(records), model, fixed=fixed)
             except SmpError as error:
-                rows.append(_row(path, **about, failure=str(error)))
+                rows.append(_make_row(path, **about, failure=str(error)))
                 continue
             held = {**found.combinations, **found.parameters}
             told = ((name, held.get(name)) for name in fleet.QUANTITIES)
             values = {name: q for name, q in told if q is not None and q.value is not None}
             verdict = dict(fit_percent=found.fit_percent.validation, unreliable=found.unreliable)
-            rows.append(_row(path, **about, values=values, **verdict))
+            rows.append(_make_row(path, **about, values=values, **verdict))
     except SmpError as error:
-        return [_row(path, failure=str(error))]
+        return [_make_row(path, failure=str(error))]
     except Exception as error:  # whatever is wrong with one recording, the others go on
-        return [_row(path, failure=f"{path}: {type(error).__name__}: {error}")]
+        return [_make_row(path, failure=f"{path}: {type(error).__name__}: {error}")]
     return rows
 
 
-def _row(path: str, **what: Any) -> fleet.Row:
+def _make_row(path: str, **what: Any) -> fleet.Row:
     """Return a row of a recording; the robot is the folder that it lies in."""
     where = Path(path).resolve()
     about = {"wheel": "", "values": {}, "date": None, **what}
     return fleet.Row(robot=where.parent.name, source=where.name, **about)
 
 
-def _results(paths: Sequence[str], settings: tuple[Any, ...], scheduler: str | None) -> Results:
+def _identify_all(
+    paths: Sequence[str], settings: tuple[Any, ...], scheduler: str | None
+) -> Results:
     """Yield results as they come; a dying worker loses only its own recording."""
     if scheduler:
-        yield from on_cluster(paths, settings, scheduler)
+        yield from identify_on_cluster(paths, settings, scheduler)
         return
     fork = multiprocessing.get_context("fork")
     tries = dict.fromkeys(paths, 0)
@@ -138,13 +140,13 @@ def _results(paths: Sequence[str], settings: tuple[Any, ...], scheduler: str | N
                 # Which one it was is not known: those under way are tried again, one at a time.
                 for path in list(tries)[: 1 if cores == 1 else cores]:
                     tries[path] += 1
-        for path in [p for p, n in tries.items() if n >= MAX_TRIES]:
+        for path in [p for p, n in tries.items() if n >= MAX_ATTEMPTS]:
             del tries[path]
             why = f"{path}: its worker was killed, perhaps for lack of memory"
-            yield path, [_row(path, failure=why, lost=True)]
+            yield path, [_make_row(path, failure=why, lost=True)]
 
 
-def on_cluster(paths: Sequence[str], settings: tuple[Any, ...], address: str) -> Results:
+def identify_on_cluster(paths: Sequence[str], settings: tuple[Any, ...], address: str) -> Results:
     """Yield results from the workers of a Dask cluster, which reruns the jobs of dead workers."""
     try:
         from dask import distributed
@@ -164,5 +166,5 @@ def on_cluster(paths: Sequence[str], settings: tuple[Any, ...], address: str) ->
         for future in call(futures):
             path = futures[future]
             lost = future.exception()
-            failed = [_row(path, failure=f"{path}: {lost}", lost=True)]
+            failed = [_make_row(path, failure=f"{path}: {lost}", lost=True)]
             yield path, future.result() if lost is None else failed

@@ -81,7 +81,7 @@ def run(made: Callable[[], Parser], work: Work | str, argv: Sequence[str] | None
         with interruptible(), warnings.catch_warnings():
             # Numerics that fail are dealt with where they occur; standard error is for the user.
             warnings.simplefilter("ignore", RuntimeWarning)
-            code = _done(work, arguments)
+            code = _run_work(work, arguments)
         sys.stdout.flush()
         return code
     except SystemExit as end:  # of the parser, which has said why
@@ -104,10 +104,10 @@ def run(made: Callable[[], Parser], work: Work | str, argv: Sequence[str] | None
         sys.stdout = before
 
 
-def _done(work: Work | str, arguments: argparse.Namespace) -> int:
+def _run_work(work: Work | str, arguments: argparse.Namespace) -> int:
     """Do the work; an error behind a Ctrl-C that some callback has dropped is that Ctrl-C."""
     try:
-        return _loaded(work)(arguments) or 0
+        return _load_work(work)(arguments) or 0
     except SmpError:
         raise
     except Exception:
@@ -115,7 +115,7 @@ def _done(work: Work | str, arguments: argparse.Namespace) -> int:
         raise
 
 
-def _loaded(work: Work | str) -> Work:
+def _load_work(work: Work | str) -> Work:
     if not isinstance(work, str):
         return work
     # Wheels are worked on side by side: the threads of a linear algebra of a few columns would

@@ -272,14 +272,14 @@ def _conclude(
         if one.failure:
             print(f"{NAME}: {one.failure}", file=sys.stderr)
         elif one.exit_code and not arguments.accept_unreliable:
-            print(f"{NAME}: {wheel}: {_tell_unreliable(estimates[wheel])}", file=sys.stderr)
+            print(f"{NAME}: {wheel}: {_describe_unreliable(estimates[wheel])}", file=sys.stderr)
         else:
             continue
         code = max(code, one.exit_code)
     return code
 
 
-def _tell_unreliable(found: Estimate) -> str:
+def _describe_unreliable(found: Estimate) -> str:
     """Return which numbers are unreliable and what to record next, in one line."""
     grave = [f for f in found.findings if f.severity in ("unreliable", "refused")]
     codes = ", ".join(dict.fromkeys(f.code for f in grave))

@@ -14,7 +14,7 @@ from types import FrameType
 
 _SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 _requested = threading.Event()
-_held = threading.Event()
+_delayed = threading.Event()
 
 
 @contextmanager
@@ -37,13 +37,13 @@ def check() -> None:
 
 
 @contextmanager
-def held() -> Iterator[None]:
+def delayed() -> Iterator[None]:
     """Delay interruptions until the end of the block."""
-    _held.set()
+    _delayed.set()
     try:
         yield
     finally:
-        _held.clear()
+        _delayed.clear()
     check()
 
 
@@ -51,5 +51,5 @@ def _interrupt(number: int, frame: FrameType | None) -> None:
     if number == signal.SIGTSTP:
         os.killpg(0, signal.SIGCONT)  # Ctrl-Z suspends this tool's helper processes
     _requested.set()
-    if not _held.is_set():
+    if not _delayed.is_set():
         raise KeyboardInterrupt

@@ -23,10 +23,11 @@ from smp_motor_ident.cli.processes import ProcessError
 from smp_motor_ident.errors import ParameterError
 from smp_motor_ident.report import templates
 
-QUEUED = 60  # messages that wait for a slow page before it gets no more samples
+MAX_QUEUED = 60  # messages that wait for a slow page before it gets no more samples
 MAX_MESSAGE = 10_000  # length of a request [bytes]
-WATCH_S, LOST_S = 0.03, 0.3  # interval of watching, and silence that stops the wheels
-ABANDONED_S = 2.0  # silence after which another page may take the place of the one that drives
+WATCH_PERIOD_S = 0.03  # period of checking the page that drives
+SILENCE_TIMEOUT_S = 0.3  # silence of that page after which the wheels stop
+TAKEOVER_AFTER_S = 2.0  # silence after which another page may take over
 HEADERS = {"Referrer-Policy": "no-referrer", "Cache-Control": "no-store"}
 POLICY = (
     "default-src 'none'; script-src 'nonce-{0}'; style-src 'nonce-{0}'; connect-src 'self'; "
@@ -83,7 +84,7 @@ class Server:
                 "with this machine's network address in it, can drive the robot",
                 flush=True,
             )
-        self._invite()
+        self._print_address()
         if self._browse and (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
             webbrowser.open(self._address())
         return self
@@ -94,9 +95,9 @@ class Server:
         self._thread.join(5.0)
 
     async def _serve(self, ready: "concurrent.futures.Future[None]") -> None:
-        app = web.Application(middlewares=[self._guard])
+        app = web.Application(middlewares=[self._authorise])
         app.add_routes([
-            web.get(f"{self._base}/", self._page), web.get(f"{self._base}/ws", self._talk),
+            web.get(f"{self._base}/", self._page), web.get(f"{self._base}/ws", self._on_connection),
             web.get(f"{self._base}/results/{{name:.+}}", self._result),
         ])  # fmt: skip
         runner = web.AppRunner(app, access_log=None, shutdown_timeout=1.0)
@@ -119,24 +120,28 @@ class Server:
         """Stop the wheels when the page that drives is heard no more."""
         link, before, late = self._laboratory.link, time.monotonic(), False
         while not self._ended.is_set():
-            await asyncio.sleep(WATCH_S)
+            await asyncio.sleep(WATCH_PERIOD_S)
             now, driver = time.monotonic(), self._driver
-            late, before = not late and now - before > LOST_S / 2, now
+            late, before = not late and now - before > SILENCE_TIMEOUT_S / 2, now
             # After a pause of this process the page may have been heard, and not been read yet.
-            if link.armed and not late and (driver is None or now - driver.heard_at > LOST_S):
-                link.halt(f"the page was not heard for {LOST_S:g} s")
+            if (
+                link.armed
+                and not late
+                and (driver is None or now - driver.heard_at > SILENCE_TIMEOUT_S)
+            ):
+                link.halt(f"the page was not heard for {SILENCE_TIMEOUT_S:g} s")
             link.watched_at = now
 
     def _address(self) -> str:
         host = {"0.0.0.0": "127.0.0.1", "::": "::1"}.get(self._host, self._host)
         return f"http://{f'[{host}]' if ':' in host else host}:{self._port}/?token={self._token}"
 
-    def _invite(self) -> None:
+    def _print_address(self) -> None:
         """Print the address of one more page; its token is good for one use."""
         self._token = secrets.token_urlsafe(16)
         print(f"lab: open {self._address()}", flush=True)
 
-    def _is_own(self, host: str) -> bool:
+    def _is_own_host(self, host: str) -> bool:
         """Return whether a host is this server's, and no name that an attacker bound to it."""
         name, _, port = host.rpartition(":")
         address = not _is_loopback(self._host) and re.fullmatch(r"[\d.]+|\[[\da-f:]+\]", name)
@@ -144,17 +149,17 @@ class Server:
         return port == str(self._port) and (known or bool(address))
 
     @web.middleware
-    async def _guard(
+    async def _authorise(
         self, request: web.Request, handler: Callable[[web.Request], Awaitable[web.StreamResponse]]
     ) -> web.StreamResponse:
         """Let only own pages in: by address, cookie and, for the stream, origin."""
-        if not self._is_own(request.host):
+        if not self._is_own_host(request.host):
             raise web.HTTPForbidden(text="lab: this address is not mine; open the one it printed\n")
         token = request.query.get("token")
         if request.path == "/" and token is not None:
             if not secrets.compare_digest(token.encode(), self._token.encode()):
                 raise web.HTTPForbidden(text="lab: the token was used; open the last one printed\n")
-            self._invite()
+            self._print_address()
             answer = web.HTTPFound(f"{self._base}/", headers=HEADERS)
             cookie = "lab", self._session
             answer.set_cookie(*cookie, path=self._base, httponly=True, samesite="Strict")
@@ -186,7 +191,7 @@ class Server:
         headers = {**HEADERS, "Content-Security-Policy": REPORT_POLICY}
         return web.FileResponse(self._laboratory.folder / name, headers=headers)
 
-    async def _talk(self, request: web.Request) -> web.WebSocketResponse:
+    async def _on_connection(self, request: web.Request) -> web.WebSocketResponse:
         socket = web.WebSocketResponse(heartbeat=5.0, max_msg_size=MAX_MESSAGE, compress=False)
         await socket.prepare(request)
         page, candidates = Page(socket), self._laboratory.candidates
@@ -198,12 +203,12 @@ class Server:
         made = [templates.encode(["design", {**one, **shown}]) for one in candidates.values()]
         for last in [*self._last.values(), *made]:
             page.queue.put_nowait(last)
-        self._tell_roles()
+        self._send_roles()
         tasks = {asyncio.ensure_future(page.write())}
         try:
             async for message in socket:
                 if message.type is WSMsgType.TEXT:  # a stop waits for no design
-                    tasks.add(task := asyncio.ensure_future(self._take(page, message.data)))
+                    tasks.add(task := asyncio.ensure_future(self._on_message(page, message.data)))
                     task.add_done_callback(tasks.discard)
         finally:
             for task in list(tasks):
@@ -212,33 +217,33 @@ class Server:
             if page is self._driver:
                 self._driver = None
                 self._laboratory.link.halt("the page that drove was closed")
-            self._tell_roles()
+            self._send_roles()
         return socket
 
-    def _tell_roles(self) -> None:
+    def _send_roles(self) -> None:
         for page in self._pages:
             role = {"drives": page is self._driver, "pages": len(self._pages)}
             page.queue.put_nowait(templates.encode(["role", role]))
 
-    async def _take(self, page: Page, text: str) -> None:
+    async def _on_message(self, page: Page, text: str) -> None:
         """Perform the request of a page, or answer with the reason of its refusal."""
         page.heard_at = time.monotonic()
         try:
-            await self._do(page, json.loads(text))
+            await self._perform(page, json.loads(text))
         except Exception as error:  # whatever a page sends, the others go on
             told = str(error) if isinstance(error, SmpError) else f"a wrong request: {error!r}"
             page.queue.put_nowait(templates.encode(["refused", told]))
 
-    async def _do(self, page: Page, message: Any) -> None:
+    async def _perform(self, page: Page, message: Any) -> None:
         wanted, driver, link = message["do"], self._driver, self._laboratory.link
         if wanted == "stop":  # which every page may
             link.halt("stop was pressed")
         elif wanted == "take":
-            if driver is not None and time.monotonic() - driver.heard_at < ABANDONED_S:
+            if driver is not None and time.monotonic() - driver.heard_at < TAKEOVER_AFTER_S:
                 raise ParameterError("another page drives; close it first")
             self._driver = page
             link.halt("another page took over")
-            self._tell_roles()
+            self._send_roles()
         elif wanted != "beat" and page is not driver:
             raise ParameterError("this page watches; another one drives")
         elif wanted == "design":
@@ -266,14 +271,14 @@ class Server:
 
     def _send(self, kind: str, content: Any) -> None:
         """Send to all pages, from any thread."""
-        self._loop.call_soon_threadsafe(self._spread, kind, content)
+        self._loop.call_soon_threadsafe(self._queue_message, kind, content)
 
-    def _spread(self, kind: str, content: Any) -> None:
+    def _queue_message(self, kind: str, content: Any) -> None:
         message = content if kind == "frame" else templates.encode([kind, content])
         if kind in ("state", "designs"):
             self._last[kind] = message
         for page in self._pages:
-            if kind != "frame" or page.queue.qsize() < QUEUED:
+            if kind != "frame" or page.queue.qsize() < MAX_QUEUED:
                 page.queue.put_nowait(message)
 
 

@@ -35,12 +35,12 @@ from smp_motor_ident.report import words
 from smp_motor_ident.report.document import read_identification
 from smp_motor_ident.result import UNITS, Quantity
 
-MOVING = ("arming", "exciting", "trying gains", "stepping")  # jobs that need the wheels
+MOVING_JOBS = ("arming", "exciting", "trying gains", "stepping")  # jobs that need the wheels
 TRIAL_S = 2.5  # for which gains on trial are watched
-STEP_AT_S, STEP_LASTS_S = 0.3, 1.2  # begin and length of the step of a trial
-STATE_S = 0.1  # shortest time between two messages about the state
-BACKGROUND = -10  # priority of computations while the robot runs
-MESSAGES = 3  # that a page shows of a kind
+STEP_BEGIN_S, STEP_LENGTH_S = 0.3, 1.2  # begin and length of the step of a trial
+STATE_PERIOD_S = 0.1  # shortest time between two messages about the state
+BACKGROUND_PRIORITY = -10  # priority of computations while the robot runs
+MAX_MESSAGES = 3  # that a page shows of a kind
 SPAWN = multiprocessing.get_context("spawn")
 COMBINATIONS = ("dc_gain", "time_constant", "time_constant_product", "static_voltage")
 
@@ -110,20 +110,20 @@ class Laboratory:
         self._reason = ""
         self.interrupt = partial(robot.processes.interrupt, "excite")  # ends an excitation at once
         self._stack = ExitStack()
-        self._taken = False  # whether the controllers are this laboratory's
+        self._holds_controllers = False  # whether the controllers are this laboratory's
 
     def close(self) -> None:
         """Stop the wheels, and give the controllers back."""
         self.link.halt("lab ends")
         with self._stack:  # gives the controllers back in any case
-            self.robot.client.spin(2 * STATE_S)
+            self.robot.client.spin(2 * STATE_PERIOD_S)
             self.robot.processes.stop("excite", "record", "identifier", "identify")
-            if self._taken:
+            if self._holds_controllers:
                 self._activate(False)
                 if self._before:
-                    self._decide(keep=False)
-                self._taken = False
-                self._note()
+                    self._end_trial(keep=False)
+                self._holds_controllers = False
+                self._store_pending_restore()
 
     def run(self) -> None:
         """Perform the requests of the pages until Ctrl-C."""
@@ -139,16 +139,16 @@ class Laboratory:
             except Exception as error:  # the wheels are still to be watched and stopped
                 known = isinstance(error, SmpError)
                 self.tell(str(error) if known else f"the request failed: {error!r}", "error")
-                if name in MOVING:
+                if name in MOVING_JOBS:
                     self.link.halt(f"{name} failed")
             finally:
                 self.state["job"] = self.state["progress"] = ""
-                self.link.rest()
+                self.link.end_plans()
 
     def tell(self, text: str, kind: str = "note") -> None:
         """Show a message on all pages."""
         shown = [*self.state["messages"], [next(self._numbers), kind, text]]
-        self.state["messages"] = shown[-MESSAGES:]
+        self.state["messages"] = shown[-MAX_MESSAGES:]
 
     def on_frame(self, slots: Array, rows: Array) -> None:
         """Send a batch of samples as rows of float32: slot, then the columns of every wheel."""
@@ -181,13 +181,13 @@ class Laboratory:
         """Verify that the controllers are inactive."""
         self._reason = reason
         self.tell(f"Stopped: {reason}.", "stop")
-        if self._taken:
+        if self._holds_controllers:
             self._jobs.put(("stopping", lambda: self._activate(False)))
 
     def on_tick(self) -> None:
         """Send the state to the pages when it has changed."""
         state, link, now = self.state, self.link, time.monotonic()
-        if now - self._told[0] < STATE_S:
+        if now - self._told[0] < STATE_PERIOD_S:
             return
         state["armed"] = link.armed
         state["drives"] = bool(link.twists.get_subscription_count())
@@ -214,12 +214,12 @@ class Laboratory:
             "tune": ("designing", lambda: self._tune(bool(message.get("accept")))),
             "apply": ("trying gains", lambda: self._apply(str(message["wheel"]))),
             "step": ("stepping", lambda: self._step(str(message["wheel"]))),
-            "keep": ("keeping gains", lambda: self._decide(keep=True)),
-            "back": ("taking gains back", lambda: self._decide(keep=False)),
+            "keep": ("keeping gains", lambda: self._end_trial(keep=True)),
+            "back": ("taking gains back", lambda: self._end_trial(keep=False)),
         }
         wanted = str(message["do"])
         if wanted == "drive":
-            if self.state["job"] not in MOVING:  # which the joystick would disturb
+            if self.state["job"] not in MOVING_JOBS:  # which the joystick would disturb
                 self.link.drive(float(message["linear"]), float(message["angular"]))
             return
         if wanted not in jobs:
@@ -244,17 +244,17 @@ class Laboratory:
 
     def _arm(self, halts: int) -> None:
         client, link = self.robot.client, self.link
-        if not self._taken:
+        if not self._holds_controllers:
             if missing := self.robot.uncontrolled():
                 told = ", ".join(missing)
                 self.tell(f"No wheel_pid runs for {told}; one is started, and ended with lab.")
                 self.robot.start_controllers(missing)
             self._stack.enter_context(client.paused(self.robot.wheels))
-            self._taken = True
+            self._holds_controllers = True
             node, name = client.node, get_controller_name(self.robot.wheels[-1])
             service = node.resolve_service_name(f"{name}/change_state")
             before = node.count_clients(service)
-            self._note()  # and wait until the controllers know the guard
+            self._store_pending_restore()  # and wait until the controllers know the guard
             client.until(lambda: node.count_clients(service) > before, steps.TIMEOUT_S)
         if link.halts != halts:
             raise ProcessError("stopped while arming")
@@ -286,7 +286,8 @@ class Laboratory:
         window = min(max(duration, 5.0), 60.0)
         processes.start(
             "identifier", "identifier", *self.robot.ros_arguments, "--ros-args", "-p", listed,
-            "-p", "period:=1.0", "-p", "share:=0.2", "-p", f"window:={window}", priority=BACKGROUND,
+            "-p", "period:=1.0", "-p", "share:=0.2", "-p", f"window:={window}",
+            priority=BACKGROUND_PRIORITY,
         )  # fmt: skip
         name = f"recording_{next(self._numbers)}"
 
@@ -317,14 +318,14 @@ class Laboratory:
         excited = sorted({wheel for some in self._recorded.values() for wheel in some})
         wheels = [a for wheel in excited for a in ("--wheel", wheel)]
         given = [*bags, "--output", str(output), *wheels]
-        self.robot.processes.start("identify", "identify", *given, priority=BACKGROUND)
+        self.robot.processes.start("identify", "identify", *given, priority=BACKGROUND_PRIORITY)
         self._wait(lambda: self.robot.processes.has_ended("identify"), name="identify")
         last = self.robot.processes.last_line("identify")
         self.robot.processes.stop("identify")
         if not (output / "identification.json").is_file():
             raise ParameterError(last)
         found = read_identification(output)
-        self.state["motors"] = {wheel: _shown(one) for wheel, one in found.items()}
+        self.state["motors"] = {wheel: _describe_motor(one) for wheel, one in found.items()}
         self.state["identified"], self.state["designed"] = output.name, None
         self.tell(f"Identified {', '.join(found)}.")
 
@@ -345,13 +346,13 @@ class Laboratory:
         """Set the gains that the page shows, and restore the old ones if the wheel misbehaves."""
         from smp_motor_control.nodes.gain_trial import try_gains
 
-        made = self._take(wheel)
+        made = self._prepare_step(wheel)
         client, new, node = self.robot.client, made["parameters"], get_controller_name(wheel)
         old = client.get_parameters({node: list(new)})[node]
         self.link.follow({wheel: [(0.0, 0.0)]})
         first = wheel not in self._before
         self._before.setdefault(wheel, old)
-        self._note()
+        self._store_pending_restore()
         outcome = try_gains(
             client, {wheel: {n: v for n, v in new.items() if n in old}}, TRIAL_S,
             self.state["supply"].get(wheel, 12.0), self.tell, lambda: self._begin_step(wheel, made),
@@ -359,19 +360,19 @@ class Laboratory:
         if outcome.reason:
             if first and not outcome.missing:
                 del self._before[wheel]
-                self._note()
+                self._store_pending_restore()
             raise ProcessError(f"the gains before were restored: {outcome.reason}")
         self._tried[wheel] = made
         self._show_step(wheel, made)
 
     def _step(self, wheel: str) -> None:
-        made = self._take(wheel)
+        made = self._prepare_step(wheel)
         self._begin_step(wheel, made)
-        end = time.monotonic() + STEP_AT_S + STEP_LASTS_S
+        end = time.monotonic() + STEP_BEGIN_S + STEP_LENGTH_S
         self._wait(lambda: time.monotonic() > end, moving=True)
         self._show_step(wheel, made)
 
-    def _take(self, wheel: str) -> dict[str, Any]:
+    def _prepare_step(self, wheel: str) -> dict[str, Any]:
         """Return the design that the page shows now, and make the wheels ready for it."""
         made = self.candidates.get(wheel, {})
         if "parameters" not in made:
@@ -382,7 +383,7 @@ class Laboratory:
 
     def _begin_step(self, wheel: str, made: Mapping[str, Any]) -> None:
         self._stepped_at = self.link.history.newest
-        plan = [(0.0, 0.0), (STEP_AT_S, made["change"]), (STEP_AT_S + STEP_LASTS_S, 0.0)]
+        plan = [(0.0, 0.0), (STEP_BEGIN_S, made["change"]), (STEP_BEGIN_S + STEP_LENGTH_S, 0.0)]
         self.link.follow({wheel: plan})
 
     def _show_step(self, wheel: str, made: Mapping[str, Any]) -> None:
@@ -399,7 +400,7 @@ class Laboratory:
         speed = np.interp(on, milliseconds, mine[shown, self._speed], right=np.nan)
         self.send("step", {"wheel": wheel, "speed": speed})
 
-    def _decide(self, keep: bool) -> None:
+    def _end_trial(self, keep: bool) -> None:
         if not self._before:
             raise ParameterError("no gains are on trial")
         if not keep:
@@ -409,7 +410,7 @@ class Laboratory:
         done = ", ".join(sorted(self._before))
         self.tell(f"{done}: {'gains kept' if keep else 'old gains restored'}.")
         self._before.clear()
-        self._note()
+        self._store_pending_restore()
         if keep:  # write the parameters of all wheels
             self._designs.update(self._tried)
             path = self.folder / f"gains_{next(self._numbers)}.yaml"
@@ -417,10 +418,12 @@ class Laboratory:
             self.state["designed"] = {**self.state["designed"], "name": path.name}
         self._tried.clear()
 
-    def _note(self) -> None:
+    def _store_pending_restore(self) -> None:
         """Let the guard halt the wheels and restore the old gains if this process dies."""
         pending = {"active": self.robot.client.pending_restore.get("active", ())}
-        pending["halt"] = [get_controller_name(w) for w in self.robot.wheels if self._taken]
+        pending["halt"] = [
+            get_controller_name(w) for w in self.robot.wheels if self._holds_controllers
+        ]
         pending["gains"] = {get_controller_name(w): old for w, old in self._before.items()}
         self.robot.client.set_pending_restore(**pending)
         self.state["trial"] = {"wheels": sorted(self._before)} if self._before else None
@@ -447,10 +450,10 @@ class Prediction:
         return speeds
 
 
-def _shown(estimate: Any) -> dict[str, Any]:
+def _describe_motor(estimate: Any) -> dict[str, Any]:
     """Return an identified motor in the words of the page."""
     held = {**estimate.combinations, **estimate.parameters}
-    grave = [one for one in estimate.findings if one.severity != "note"][:MESSAGES]
+    grave = [one for one in estimate.findings if one.severity != "note"][:MAX_MESSAGES]
     unreliable = any(one.severity in ("unreliable", "refused") for one in grave)
     return {
         "state": "unreliable" if unreliable else "identified",

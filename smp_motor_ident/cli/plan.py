@@ -25,17 +25,17 @@ SIGNALS = (
 )
 """Excitations: signal, shares of amplitude and duration, and their recording."""
 
-FURTHER = "further"  # name of the recording that an identification asks for
+EXTRA = "further"  # name of the recording that an identification asks for
 # Parts after the recordings
-IDENTIFYING, AGAIN, TUNING = "identifying", "identifying again", "tuning"
+IDENTIFYING, IDENTIFYING_AGAIN, TUNING = "identifying", "identifying again", "tuning"
 DRIVING = "driving on the new gains"
 
-MAX_FURTHER_S = 120.0  # of such a recording [s]
-CHECK, START, COMPUTE, DRIVE = 8.0, 4.0, 4.0, 12.0
+MAX_EXTRA_S = 120.0  # of such a recording [s]
+CHECK_S, START_S, COMPUTE_S, DRIVE_S = 8.0, 4.0, 4.0, 12.0
 """First guesses [s]: the test of one wheel, the start and end of processes around a signal, the
 identification or tuning of one wheel, the drive."""
 
-DRAWN, COLUMNS, BLOCKS = 4.0, 72, "▁▂▃▄▅▆▇█"
+DRAWN_S, COLUMNS, BLOCKS = 4.0, 72, "▁▂▃▄▅▆▇█"
 """So many seconds of a signal are drawn, on so many columns, with these levels."""
 
 
@@ -67,25 +67,25 @@ def recordings(amplitude: float, duration: float) -> list[Recording]:
     ]
 
 
-def plan_further(estimates: Mapping[str, Estimate], amplitude: float) -> Recording | None:
+def plan_extra_recording(estimates: Mapping[str, Estimate], amplitude: float) -> Recording | None:
     """Return the recording that would reduce the uncertainty of these estimates, or None.
 
     Open is what gains are designed from: parameters and combinations that the data give, known to
     less than the accuracy wanted.  Of several wheels the one that needs the longest decides.
     """
     proposals = [
-        what_next(one, REQUIRED_ACCURACY, supply=amplitude, longest=MAX_FURTHER_S)
+        what_next(one, REQUIRED_ACCURACY, supply=amplitude, longest=MAX_EXTRA_S)
         for one in estimates.values()
-        if _is_open(one)
+        if _is_uncertain(one)
     ]
     if not proposals:
         return None
     longest = max(proposals, key=lambda one: one.duration)
     signal = Excitation("fourier", longest.duration, longest.amplitude, longest.band)
-    return Recording(FITTED, FURTHER, signal)
+    return Recording(FITTED, EXTRA, signal)
 
 
-def _is_open(estimate: Estimate) -> bool:
+def _is_uncertain(estimate: Estimate) -> bool:
     known = {**estimate.parameters, **estimate.combinations}
     names = ("dc_gain", "time_constant", "resistance", "motor_constant", "inertia")
     given = (one for name in names if (one := known.get(name)) is not None and one.value)
@@ -144,14 +144,14 @@ def schedule(
     """Return the parts of a commissioning that are not done yet."""
     made = Schedule()
     for wheel in () if checked else wheels:
-        made.add(f"checking {wheel}", "check", CHECK)
+        made.add(f"checking {wheel}", "check", CHECK_S)
     for part in parts:
-        made.add(part.part, "signal", part.excitation.duration + START)
+        made.add(part.part, "signal", part.excitation.duration + START_S)
     if not identified:
-        made.add(IDENTIFYING, "identify", COMPUTE * len(wheels))
+        made.add(IDENTIFYING, "identify", COMPUTE_S * len(wheels))
     if not tuned:
-        made.add(TUNING, "tune", COMPUTE * len(wheels))
-    made.add(DRIVING, "drive", DRIVE)
+        made.add(TUNING, "tune", COMPUTE_S * len(wheels))
+    made.add(DRIVING, "drive", DRIVE_S)
     return made
 
 
@@ -164,7 +164,7 @@ def format_duration(seconds: float) -> str:
 def draw_plan(amplitude: float, duration: float, wheels: Sequence[str]) -> list[str]:
     """Return the plan in words, each signal with its first seconds as a line of blocks."""
     lines = [
-        f"first: each wheel alone, some {CHECK:g} s: slowly until it turns, then at growing "
+        f"first: each wheel alone, some {CHECK_S:g} s: slowly until it turns, then at growing "
         f"voltages up to {amplitude:g} V, both ways; signs, gearing, dead zone, supply and load "
         "are checked"
     ]
@@ -172,7 +172,7 @@ def draw_plan(amplitude: float, duration: float, wheels: Sequence[str]) -> list[
     for one in parts:
         part = one.excitation
         signal = SHAPES[part.signal](amplitude=part.amplitude)
-        shown = min(part.duration, DRAWN)
+        shown = min(part.duration, DRAWN_S)
         level = signal(np.arange(COLUMNS, dtype=np.float64) * (shown / COLUMNS)) / part.amplitude
         bars = "".join(BLOCKS[round((1 + float(v)) / 2 * (len(BLOCKS) - 1))] for v in level)
         lines.append(
@@ -185,7 +185,7 @@ def draw_plan(amplitude: float, duration: float, wheels: Sequence[str]) -> list[
     accuracy = 100 * REQUIRED_ACCURACY
     lines += [
         f"then: identify; where a number is not known to {accuracy:g} %, one more Fourier signal "
-        f"of at most {MAX_FURTHER_S:g} s; tune; a drive of some {DRIVE:g} s with the gains on "
+        f"of at most {MAX_EXTRA_S:g} s; tune; a drive of some {DRIVE_S:g} s with the gains on "
         "trial",
         f"{begin:g} s of excitation, about {total} in all for {len(wheels)} wheels. "
         "Nothing was moved.",

@@ -111,7 +111,7 @@ class Processes:
         """Start a node or a tool, with real-time priority, or, below 0, with less than usual."""
         self._logs.mkdir(parents=True, exist_ok=True)
         parent = os.getpid()
-        with (self._logs / f"{name}.log").open("wb") as log, interruption.held():
+        with (self._logs / f"{name}.log").open("wb") as log, interruption.delayed():
             self._running[name] = subprocess.Popen(
                 [*_command(node), *arguments],
                 stdin=subprocess.DEVNULL,

@@ -24,7 +24,7 @@ SIGNALS = ("time", "voltage", "applied", "speed", "angle")
 
 
 def tune_by_relay(arguments: argparse.Namespace, files: Sequence[Path]) -> int:
-    """Make a wheel oscillate and write the gains that follow."""
+    """Make a wheel run_relay_test and write the gains that follow."""
     supply, wheel = arguments.supply, arguments.relay
     if supply is None or not 0 < supply < math.inf:
         raise ParameterError("--relay needs the supply voltage; give --supply")
@@ -42,10 +42,10 @@ def tune_by_relay(arguments: argparse.Namespace, files: Sequence[Path]) -> int:
         flush=True,
     )
     with connect("tune", arguments.ros_arguments) as robot:
-        from smp_motor_control.nodes.relay_test import Relay, oscillate
+        from smp_motor_control.nodes.relay_test import Relay, run_relay_test
 
         relay = Relay(bias, amplitude, arguments.relay_hysteresis)
-        seen = oscillate(robot, wheel, relay, arguments.relay_seconds)
+        seen = run_relay_test(robot, wheel, relay, arguments.relay_seconds)
     gain, period = read_oscillation(*resample_evenly(seen))
     rule, structure = arguments.rule or "tyreus_luyben", arguments.structure or "pi"
     ruled = by_rule(rule, structure, gain, period)

@@ -89,16 +89,16 @@ def excite(
 
 def identify_wheels(bag: Path, output: Path, *options: str) -> dict[str, Estimate]:
     """Run ``identify`` on a bag."""
-    _succeed("identify", identify.main([str(bag), "--output", str(output), *options]))
+    _require_success("identify", identify.main([str(bag), "--output", str(output), *options]))
     return read_identification(output)
 
 
 def tune_wheels(identified: Path, output: Path, *options: str) -> None:
     """Run ``tune`` on an identification."""
-    _succeed("tune", tune.main([str(identified), "--output", str(output), *options]))
+    _require_success("tune", tune.main([str(identified), "--output", str(output), *options]))
 
 
-def _succeed(tool: str, code: int) -> None:
+def _require_success(tool: str, code: int) -> None:
     if code == 130:
         raise KeyboardInterrupt
     if code != 0:

@@ -77,7 +77,7 @@ def _values(estimate: Estimate, intervals: bool) -> Table:
     return made
 
 
-_WHAT_TO_MAP = (
+_MAPPING_ADVICE = (
     "map the columns above: --map voltage=… velocity=… (or position=…, count=…); with several "
     "files: voltage=/FILE.COLUMN; a constant voltage: voltage=COLUMN*0+VOLTS. Without a voltage or "
     "a command no motor can be identified; see docs/mapping.md"
@@ -106,7 +106,7 @@ def print_topics(paths: Sequence[str], msg_files: Sequence[str], program: str) -
             if listing.remark:
                 out.print(f"  note: {listing.remark}", soft_wrap=True)
         else:
-            out.print(f"{listing.remark}; {_WHAT_TO_MAP}", soft_wrap=True)
+            out.print(f"{listing.remark}; {_MAPPING_ADVICE}", soft_wrap=True)
     return 0
 
 

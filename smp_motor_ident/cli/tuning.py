@@ -26,7 +26,7 @@ from smp_motor_ident.tune.wheels import WheelSet
 from smp_motor_ident.tune.writing import gains_document, gains_yaml, parameters, slow_loop
 
 DEFAULT_RATE = 200.0  # steps per second where neither the user nor the identification says [Hz]
-SOURCES, COMPARISON, DESIGN = 1.0, 3.0, 2.0
+SOURCES_S, COMPARISON_S, DESIGN_S = 1.0, 3.0, 2.0
 """Time per wheel on one core [s]: comparing speed sources, comparing methods, one design."""
 
 
@@ -107,20 +107,20 @@ def design_together(
     """Return the designs, and the reasons for the delays and sources of speed that they assume."""
     measured = {} if arguments.bag is None else measure_delay(arguments.bag)
     loops = {w: loop_for(one, arguments, measured.get(w)) for w, one in estimates.items()}
-    reasons = {"delays": tell_delays(loops, measured, arguments), "speed_sources": []}
+    reasons = {"delays": describe_delays(loops, measured, arguments), "speed_sources": []}
     print("".join(f"{line}\n" for line in reasons["delays"]), end="")
     targets = _targets(arguments)
     method = arguments.method
     with frame.progress("tune") as say:
         if arguments.speed_source == "auto":
-            say(_taking("comparing the sources of speed", SOURCES, estimates))
+            say(_announce("comparing the sources of speed", SOURCES_S, estimates))
             loops, reasons["speed_sources"] = choose_sources(estimates, loops, targets)
         if arguments.compare:
-            say(_taking("comparing the methods", COMPARISON, estimates))
+            say(_announce("comparing the methods", COMPARISON_S, estimates))
             method = _compare(estimates, loops, targets)
             known = (*METHODS[method].targets, *case.COMMON_TARGETS)
             targets = {k: v for k, v in targets.items() if k in known}
-        say(_taking("designing", DESIGN, estimates))
+        say(_announce("designing", DESIGN_S, estimates))
         wheels = design_wheels(
             estimates, loops, method, arguments.sets, together=not arguments.alone, **targets
         )
@@ -128,7 +128,7 @@ def design_together(
     return wheels, reasons
 
 
-def _taking(text: str, seconds: float, wheels: Sized) -> str:
+def _announce(text: str, seconds: float, wheels: Sized) -> str:
     """Return a step in words, with its duration."""
     return f"{text}, which takes about {seconds * len(wheels):.0f} s"
 
@@ -183,7 +183,7 @@ def _export(arguments: argparse.Namespace) -> int:
     loops = {wheel: loop_for(one, arguments) for wheel, one in estimates.items()}
     targets = _targets(arguments)
     with frame.progress("tune") as say:
-        say(_taking(f"designing for {target.title}", DESIGN, estimates))
+        say(_announce(f"designing for {target.title}", DESIGN_S, estimates))
         text, _ = export(arguments.export, estimates, loops, **targets)
     if output is None:
         print(text, end="")
@@ -241,7 +241,7 @@ def _compare(
         name, why = recommend(results)
         votes[name] += 1
         reason.setdefault(name, why)
-        print(f"\n{wheel}\n{HEAD}")
+        print(f"\n{wheel}\n{TABLE_HEAD}")
         for method, result in results.items():
             mark = "*" if method == name else " "
             print(f"{mark} {method:16s} {row(result)}")
@@ -250,7 +250,7 @@ def _compare(
     return chosen
 
 
-def tell_delays(
+def describe_delays(
     loops: Mapping[str, Loop], measured: Mapping[str, TransportDelay], arguments: argparse.Namespace
 ) -> list[str]:
     """Return the sources of delays measured from a bag, in a line for each wheel."""
@@ -269,7 +269,7 @@ def tell_delays(
     return lines
 
 
-HEAD = (
+TABLE_HEAD = (
     f"  {'method':16s} {'p':>8} {'i':>8} {'d':>8} {'PM':>4} {'GM':>6} {'Ms':>5} {'settle':>8} "
     f"{'over':>6} {'load':>8} {'volts':>7} {'noise':>7}"
 )
@@ -277,7 +277,7 @@ HEAD = (
 
 
 def row(result: Design | DesignError) -> str:
-    """Return a design as a row under :data:`HEAD`."""
+    """Return a design as a row under :data:`TABLE_HEAD`."""
     if isinstance(result, DesignError):
         return str(result)
     g, m, f = result.gains, result.margins, result.performance
@@ -290,7 +290,7 @@ def row(result: Design | DesignError) -> str:
 
 def show(wheels: WheelSet) -> None:
     """Print the designs of all wheels, and the reasons for them."""
-    print(f"  {'wheel':16s}{HEAD[18:]}")
+    print(f"  {'wheel':16s}{TABLE_HEAD[18:]}")
     for wheel, design in wheels.designs.items():
         print(f"  {wheel:16s} {row(design)}")
     print(wheels.reason)

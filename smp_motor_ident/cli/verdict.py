@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from smp_motor_control.motor.file import MotorEntry
 from smp_motor_control.motor.parameters import COMBINATIONS, PHYSICAL
-from smp_motor_ident.cli.driving import Designed
+from smp_motor_ident.cli.driving import DesignSet
 from smp_motor_ident.cli.tables import console, table
 from smp_motor_ident.report import words
 from smp_motor_ident.result import Estimate, Quantity
@@ -43,7 +43,7 @@ class Check:
         return self.worst <= self.limit
 
 
-def _compared(entry: MotorEntry, estimate: Estimate) -> list[tuple[str, float, Quantity]]:
+def _compare_with_truth(entry: MotorEntry, estimate: Estimate) -> list[tuple[str, float, Quantity]]:
     """Return name, truth and estimate of every quantity that the estimate claims to know."""
     held = {**estimate.combinations, **estimate.parameters}
     names = (*COMBINATIONS, *PHYSICAL) if entry.knows_current else COMBINATIONS
@@ -53,7 +53,7 @@ def _compared(entry: MotorEntry, estimate: Estimate) -> list[tuple[str, float, Q
 
 def show(
     truth: Mapping[str, MotorEntry],
-    designed: Designed,
+    designed: DesignSet,
     changes: Mapping[str, Sequence[Change]],
 ) -> None:
     """Print one table per wheel."""
@@ -61,7 +61,7 @@ def show(
     for wheel, estimate in designed.estimates.items():
         title = f"{words.label(wheel)}: {words.model(estimate.model)}"
         made = table(title, "", "true", "identified", "error/std")
-        compared = _compared(truth[wheel], estimate)
+        compared = _compare_with_truth(truth[wheel], estimate)
         for name, true, quantity in compared:
             std, error = quantity.std or 0.0, (quantity.value or 0.0) - true
             made.add_row(
@@ -94,7 +94,7 @@ def check_estimates(
     beyond = set()
     for wheel in estimates:
         timing = next((s.moves for s in estimates[wheel].systematic if s.cause == "timing"), {})
-        for name, true, quantity in _compared(truth[wheel], estimates[wheel]):
+        for name, true, quantity in _compare_with_truth(truth[wheel], estimates[wheel]):
             error = abs((quantity.value or math.nan) - true)
             if name == "dc_gain":
                 gain.append((100.0 * error / true, wheel))

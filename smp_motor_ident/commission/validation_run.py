@@ -17,7 +17,7 @@ BLOCK = 0.5
 
 
 @dataclass(frozen=True, eq=False)
-class Simulated:
+class SimulatedRun:
     """Measured and simulated motor speed of one stretch of data."""
 
     time: Array  # [s]
@@ -34,7 +34,7 @@ class Simulated:
         return np.asarray(total[count > 0] / count[count > 0])
 
 
-def judge(wheel: str, fitted: Sequence[Simulated], held_out: Sequence[Simulated]) -> Finding:
+def judge(wheel: str, fitted: Sequence[SimulatedRun], held_out: Sequence[SimulatedRun]) -> Finding:
     """Return the fit to held-out data, refused if it is significantly and clearly worse."""
     before = np.concatenate([one.powers() for one in fitted])
     after = np.concatenate([one.powers() for one in held_out])

@@ -87,7 +87,7 @@ class Figures:
     level: float  # largest commanded voltage [V]
 
 
-def answers_well(level: float, breakaway: float, counts: float) -> bool:
+def responds_clearly(level: float, breakaway: float, counts: float) -> bool:
     """Tell whether a wheel's response depends more on the motor than on friction."""
     return level * MAX_FRICTION_SHARE >= breakaway and counts >= MIN_RESPONSE_COUNTS
 

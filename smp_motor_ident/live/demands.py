@@ -14,7 +14,7 @@ least number of crossings of the mean voltage."""
 ROUNDING = 1e-9  # relative rounding error of equal voltages computed in different ways
 
 
-def missing(record: Record | None) -> list[str]:
+def find_missing_excitation(record: Record | None) -> list[str]:
     """Return descriptions of missing excitation; empty if an estimate is possible."""
     if record is None:
         return ["no motor_state yet"]

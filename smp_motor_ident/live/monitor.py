@@ -50,7 +50,7 @@ COPPER_COEFFICIENT = 0.00393  # temperature coefficient of copper's resistance [
 
 
 @dataclass(frozen=True)
-class Commissioned:
+class CommissionedValues:
     """Commissioned values of a motor, at the motor shaft, SI."""
 
     # resistance, inductance, motor_constant, inertia: [ohm, H, N m/A, kg m^2]
@@ -71,7 +71,7 @@ class Commissioned:
                 raise ParameterError(f"commissioned {name} is {value}; it must be positive")
 
 
-def commissioned_of(found: Estimate) -> Commissioned:
+def read_commissioned_values(found: Estimate) -> CommissionedValues:
     """Return the commissioned values of a motor whose recording determined all of them."""
     names = ("resistance", "inductance", "motor_constant", "inertia", "viscous_friction",
              "coulomb_friction")  # fmt: skip
@@ -82,7 +82,7 @@ def commissioned_of(found: Estimate) -> Commissioned:
             f"{found.wheel}: {', '.join(lacking)} unknown: to watch a motor, commission it with "
             "its current measured"
         )
-    return Commissioned(**values, supply_voltage=found.hardware.supply_voltage or 12.0)
+    return CommissionedValues(**values, supply_voltage=found.hardware.supply_voltage or 12.0)
 
 
 @dataclass
@@ -135,7 +135,7 @@ class _Block:
 class Monitor:
     """Monitor of one motor relative to its commissioned values."""
 
-    def __init__(self, commissioned: Commissioned) -> None:
+    def __init__(self, commissioned: CommissionedValues) -> None:
         self.commissioned = c = commissioned
         start = np.array([c.resistance, c.motor_constant, c.inductance, 0.0])
         size = np.array(

@@ -36,16 +36,16 @@ from smp_motor_control.nodes.settings import Parameters
 from smp_motor_ident.bag import read
 from smp_motor_ident.bag.window import Window
 from smp_motor_ident.estimate import estimate
-from smp_motor_ident.live.demands import MIN_DURATION_S, missing
-from smp_motor_ident.live.monitor import Monitor, commissioned_of
+from smp_motor_ident.live.demands import MIN_DURATION_S, find_missing_excitation
+from smp_motor_ident.live.monitor import Monitor, read_commissioned_values
 from smp_motor_ident.record import Record
 from smp_motor_ident.report import document, history
 from smp_motor_ident.result import Estimate
 
-QUEUE_DEPTH = QoSProfile(depth=1000, reliability=ReliabilityPolicy.BEST_EFFORT)
+STATE_QOS = QoSProfile(depth=1000, reliability=ReliabilityPolicy.BEST_EFFORT)
 """Depth of the queue, since samples wait on a busy machine and a lost one harms the fit."""
 
-TAKE_PERIOD = 0.05
+TAKE_PERIOD_S = 0.05
 """Between two batches of samples [s]: waking up for each would cost half as much again."""
 
 HISTORY_PERIOD_S = 60.0  # between two lines of a history [s]
@@ -100,7 +100,11 @@ class Wheel:
         )
         topic = f"{name}/motor_state"
         self._states = node.create_subscription(
-            MotorState, topic, self._on_state, QUEUE_DEPTH, callback_group=executor.OwnerReads()
+            MotorState,
+            topic,
+            self._on_state,
+            STATE_QOS,
+            callback_group=executor.PolledSubscriptions(),
         )
         topic = f"{name}/motor_description"
         node.create_subscription(MotorDescription, topic, self._on_description, runtime.LATCHED)
@@ -140,7 +144,7 @@ class Wheel:
         self.joint_name = message.joint_name or self.joint_name
         self.window.hardware = read.convert_description(message)
 
-    def tell(self, status: str, found: Estimate | None = None) -> None:
+    def publish(self, status: str, found: Estimate | None = None) -> None:
         self.status = status
         message = MotorParameters(joint_name=self.joint_name, status=status)
         message.header.stamp = self.stamp
@@ -165,7 +169,7 @@ class Identifier(Node):
         super().__init__("identifier")
         self._given = Parameters(self, Settings)
         settings = self._given.settings
-        monitors = _monitors(settings)
+        monitors = _make_monitors(settings)
         self._wheels = {
             name: Wheel(self, name, settings.window, monitors.get(name)) for name in settings.wheels
         }
@@ -173,8 +177,8 @@ class Identifier(Node):
         self._not_before = 0.0
         self._compiled = False  # the first estimate loads or compiles code, too: it counts for none
         self._diagnostics = runtime.Diagnostics(self, self._assess)
-        runtime.steady_timer(self, TAKE_PERIOD, self._take_all)
-        runtime.steady_timer(self, settings.period, self._begin)
+        runtime.steady_timer(self, TAKE_PERIOD_S, self._take_all)
+        runtime.steady_timer(self, settings.period, self._start_estimates)
         runtime.steady_timer(self, 0.1, self._publish_finished)
         if settings.history:
             runtime.steady_timer(self, HISTORY_PERIOD_S, self._add_history)
@@ -183,7 +187,7 @@ class Identifier(Node):
         for wheel in self._wheels.values():
             wheel.take()
 
-    def _begin(self) -> None:
+    def _start_estimates(self) -> None:
         """Hand every window with enough excitation to the worker; report the others' lack.
 
         A pause in proportion to its cost follows every estimate; the last window before samples
@@ -197,11 +201,11 @@ class Identifier(Node):
             try:
                 self._check_source(wheel)
                 record = wheel.window.record()
-                lacks = missing(record)
+                lacks = find_missing_excitation(record)
             except (SmpError, ArithmeticError, ValueError) as error:
                 record, lacks = None, [str(error)]
             if lacks or record is None:
-                wheel.tell("collecting: " + "; ".join(lacks))
+                wheel.publish("collecting: " + "; ".join(lacks))
             elif ceased or now >= self._not_before:
                 wheel.estimated = wheel.seen
                 wheel.running = self._worker.submit(partial(_identify, record, settings.model))
@@ -225,12 +229,12 @@ class Identifier(Node):
             self._compiled = True
             if isinstance(found, Estimate):
                 why = "; ".join(f.message for f in found.findings if f.severity == "unreliable")
-                wheel.tell(f"unreliable: {why}" if why else "valid", found)
+                wheel.publish(f"unreliable: {why}" if why else "valid", found)
             elif isinstance(found, SmpError):
-                wheel.tell(f"refused: {found}")
+                wheel.publish(f"refused: {found}")
             else:
                 self.get_logger().error(f"{wheel.window.wheel}: {found!r}")
-                wheel.tell(f"refused: the estimator failed with {found!r}")
+                wheel.publish(f"refused: the estimator failed with {found!r}")
 
     def _assess(self) -> tuple[bytes, str, dict[str, object]]:
         states: dict[str, object] = {name: wheel.status for name, wheel in self._wheels.items()}
@@ -278,7 +282,7 @@ class Identifier(Node):
         self._worker.shutdown(wait=False, cancel_futures=True)
 
 
-def _monitors(settings: Settings) -> dict[str, Monitor]:
+def _make_monitors(settings: Settings) -> dict[str, Monitor]:
     """Return a monitor of every wheel that was commissioned; refuse one that cannot be watched."""
     if not settings.commissioned:
         if settings.history:
@@ -287,7 +291,7 @@ def _monitors(settings: Settings) -> dict[str, Monitor]:
             )
         return {}
     found = document.read_identification(Path(settings.commissioned))
-    return {n: Monitor(commissioned_of(found[n])) for n in settings.wheels if n in found}
+    return {n: Monitor(read_commissioned_values(found[n])) for n in settings.wheels if n in found}
 
 
 def _identify(record: Record, model: str) -> tuple[Estimate | Exception, float]:

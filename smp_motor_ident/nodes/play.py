@@ -38,7 +38,7 @@ class Player(Node):
         self._replay, self._options = replay, options
         self._outputs: dict[str, tuple[str, Publisher]] = {}
         for channel in channels:
-            self._offer(channel)
+            self._add_publisher(channel)
         if not self._outputs:
             raise SmpError("no topic of the bag can be played")
         self._clock = self.create_publisher(Clock, "/clock", 10) if options.clock else None
@@ -48,7 +48,7 @@ class Player(Node):
         self._thread = threading.Thread(target=self._run, daemon=True)
         self._thread.start()
 
-    def _offer(self, channel: Channel) -> None:
+    def _add_publisher(self, channel: Channel) -> None:
         kept, _ = self._outputs.get(channel.topic, (channel.type, None))
         if kept != channel.type:  # a node cannot offer one topic with two types
             self.get_logger().warning(
@@ -187,7 +187,7 @@ def _check(arguments: argparse.Namespace) -> None:
             raise SmpError(f"--{name.replace('_', '-')} is {value:g}; it must be {what}")
 
 
-def _chosen(replay: Replay, arguments: argparse.Namespace) -> list[Channel]:
+def _select_channels(replay: Replay, arguments: argparse.Namespace) -> list[Channel]:
     names = {name if name.startswith("/") else f"/{name}" for name in arguments.topics}
     there = {channel.topic for channel in replay.channels}
     if missing := names - there:
@@ -204,6 +204,6 @@ def main(argv: list[str] | None = None) -> int:
     def make() -> Any:
         _check(arguments)
         replay = Replay(Path(arguments.bag))
-        return Player(replay, _chosen(replay, arguments), arguments)
+        return Player(replay, _select_channels(replay, arguments), arguments)
 
     return runtime.run("play", make, ros)

@@ -32,8 +32,8 @@ from smp_motor_control.ros_arguments import split_arguments
 from smp_motor_ident.bag.writer import DEFAULT_QOS, BagWriter
 from smp_motor_ident.nodes.bag_arguments import message_class, quality
 
-TAKE_PERIOD = 0.004
-LOOK_PERIOD = 0.05
+TAKE_PERIOD_S = 0.004
+DISCOVERY_PERIOD_S = 0.05
 DEPTH = 2000  # depth of the DDS queue per topic: two seconds of 1 kHz while the disk is busy
 
 
@@ -42,14 +42,14 @@ ONE_PUBLISHER = ("smp_interfaces/msg/MotorState", "smp_interfaces/msg/PidState")
 
 
 @dataclass(frozen=True)
-class Choice:
+class TopicFilter:
     """Topics to record; without names and a pattern all but those with a leading underscore."""
 
     names: frozenset[str]
     pattern: re.Pattern[str] | None = None
     exclude: re.Pattern[str] | None = None
 
-    def wants(self, topic: str) -> bool:
+    def matches(self, topic: str) -> bool:
         if self.exclude and self.exclude.fullmatch(topic):
             return False
         if topic in self.names or "/_" in topic:
@@ -90,25 +90,25 @@ def qos_document(qos: QoSProfile) -> dict[str, Any]:
 class Recorder(Node):
     """Recorder of topics as they appear, for ``duration`` [s] or without end."""
 
-    def __init__(self, writer: BagWriter, choice: Choice, duration: float = 0.0) -> None:
+    def __init__(self, writer: BagWriter, choice: TopicFilter, duration: float = 0.0) -> None:
         super().__init__("record")
         self._writer = writer
         own = {self.resolve_topic_name(name) for name in choice.names}
         self._choice = replace(choice, names=frozenset(own))
         self._topics: dict[str, Topic] = {}
         self._refused: set[str] = set()
-        self._group = executor.OwnerReads()
-        self._look()
-        runtime.steady_timer(self, LOOK_PERIOD, self._look)
-        runtime.steady_timer(self, TAKE_PERIOD, self._take_all)
+        self._group = executor.PolledSubscriptions()
+        self._update_subscriptions()
+        runtime.steady_timer(self, DISCOVERY_PERIOD_S, self._update_subscriptions)
+        runtime.steady_timer(self, TAKE_PERIOD_S, self._take_all)
         if duration:
             runtime.steady_timer(self, duration, runtime.finish)
         self.get_logger().info(f"recording to {writer.path}")
 
-    def _look(self) -> None:
+    def _update_subscriptions(self) -> None:
         """Subscribe to new topics, and match publishers with weaker QoS than the others."""
         for name, types in self.get_topic_names_and_types():
-            if not self._choice.wants(name) or name in self._refused:
+            if not self._choice.matches(name) or name in self._refused:
                 continue
             infos = self.get_publishers_info_by_topic(name)
             known = self._topics.get(name)
@@ -120,7 +120,7 @@ class Recorder(Node):
                     continue
                 self._start(name, types[0], infos)
             else:
-                self._adapt(name, known, infos)
+                self._reduce_qos(name, known, infos)
 
     def _refuse(self, name: str, why: str) -> None:
         self._refused.add(name)
@@ -144,7 +144,7 @@ class Recorder(Node):
             message, name, lambda _: None, qos, raw=True, callback_group=self._group
         )
 
-    def _adapt(self, name: str, topic: Topic, infos: list[TopicEndpointInfo]) -> None:
+    def _reduce_qos(self, name: str, topic: Topic, infos: list[TopicEndpointInfo]) -> None:
         """Reduce the requested QoS to that of a weaker new publisher."""
         topic.publishers, topic.last_number = len(infos), 0
         qos = subscription_qos([info.qos_profile for info in infos])
@@ -225,7 +225,7 @@ def _pattern(text: str) -> re.Pattern[str]:
         raise argparse.ArgumentTypeError(f"{text!r} is not a regular expression: {error}") from None
 
 
-def _make_room(path: Path, force: bool) -> None:
+def _remove_old_bag(path: Path, force: bool) -> None:
     """Remove a bag to be replaced; refuse anything else."""
     if not path.exists():
         return
@@ -242,8 +242,8 @@ def main(argv: list[str] | None = None) -> int:
     output = Path(arguments.output or f"rosbag2_{datetime.now():%Y_%m_%d-%H_%M_%S}")
 
     def make() -> Recorder:
-        choice = Choice(frozenset(arguments.topics), arguments.regex, arguments.exclude)
-        _make_room(output, arguments.force)
+        choice = TopicFilter(frozenset(arguments.topics), arguments.regex, arguments.exclude)
+        _remove_old_bag(output, arguments.force)
         return Recorder(BagWriter(output), choice, arguments.duration)
 
     return runtime.run("record", make, ros)

@@ -16,7 +16,7 @@ from scipy.special import stdtrit
 
 from smp_motor_control.arrays import Array
 from smp_motor_control.encoder import Encoder
-from smp_motor_control.fields import parameters_in, settings_of
+from smp_motor_control.fields import build_settings, parameters_in
 from smp_motor_control.motor.file import MotorEntry
 from smp_motor_control.motor.hardware import DrivenMotor, DriveSettings
 from smp_motor_control.motor.parameters import COMBINATIONS, Gearbox, MotorParameters
@@ -301,7 +301,7 @@ def report_silence(silence: float) -> list[Finding]:
 def loop_settings(parameters: Mapping[str, Any]) -> LoopSettings:
     """Return the running loop of a wheel's parameters, as ``tune`` writes them."""
     usual = {name: one.default for name, one in parameters_in(LoopSettings).items()}
-    return settings_of(LoopSettings, usual | flatten(parameters))
+    return build_settings(LoopSettings, usual | flatten(parameters))
 
 
 def _motors(estimate: Estimate, supply: float) -> list[MotorEntry]:

@@ -90,7 +90,7 @@ def test_wheels_stay_within_their_reach(case):
         wheel_radius=case["wheel_diameter"] / 2.0,
         max_wheel_speed=case["max_rpm"] / to_rpm,
     )
-    left, right = robot.reachable_wheel_speeds(case["linear_x"], case["angular_z"])
+    left, right = robot.limit_wheel_speeds(case["linear_x"], case["angular_z"])
     assert left * to_rpm == pytest.approx(case["expect_left_rpm"], abs=case["abs_tol"])
     assert right * to_rpm == pytest.approx(case["expect_right_rpm"], abs=case["abs_tol"])
 

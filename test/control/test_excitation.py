@@ -7,7 +7,15 @@ import numpy as np
 import pytest
 
 from smp_motor_control.errors import ParameterError
-from smp_motor_control.excitation import SIGNALS, Bounded, Fourier, Ramp, Sine, Square, multisine
+from smp_motor_control.excitation import (
+    SIGNALS,
+    Bounded,
+    Fourier,
+    Ramp,
+    Sine,
+    Square,
+    draw_multisine,
+)
 
 RATES = (50.0, 100.0, 200.0, 500.0, 1000.0)
 
@@ -39,7 +47,7 @@ def test_period_is_far_from_every_whole_number_of_samples(kind, rate):
 
 
 def test_tones_are_incommensurate_and_span_the_range():
-    f, _, _ = multisine(lowest=0.1, highest=20.0, tones=24, seed=0)
+    f, _, _ = draw_multisine(lowest=0.1, highest=20.0, tones=24, seed=0)
     # Irrational places near the nominal ends: within 2 % of them.
     assert f[0] == pytest.approx(0.1, rel=0.02) and f[-1] == pytest.approx(20.0, rel=0.02)
     assert np.all(np.diff(f) > 0)

@@ -10,7 +10,7 @@ from types import SimpleNamespace
 import pytest
 from wheel_world import DT, SETTINGS, World
 
-from smp_motor_control.fields import parameters_in, settings_of
+from smp_motor_control.fields import build_settings, parameters_in
 from smp_motor_control.motor.file import load_motors
 from smp_motor_control.motor.hardware import DrivenMotor, DriveSettings
 from smp_motor_control.parameter_file import flatten, read_parameters
@@ -27,7 +27,7 @@ def given(file: str, wheel: str = "front_left") -> WheelSettings:
     known = parameters_in(WheelSettings)
     values = {name: entry.default for name, entry in known.items()}
     format_parameters = flatten(read_parameters(CONFIG / file)[f"/**/{wheel}/wheel_pid"])
-    return settings_of(WheelSettings, {**values, **format_parameters})
+    return build_settings(WheelSettings, {**values, **format_parameters})
 
 
 def p_alone(p: float) -> WheelSettings:

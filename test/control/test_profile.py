@@ -12,7 +12,7 @@ from scipy.linalg import expm
 from scipy.optimize import linprog
 
 from smp_motor_control.errors import ParameterError
-from smp_motor_control.fields import settings_of
+from smp_motor_control.fields import build_settings
 from smp_motor_control.reference.minimum_jerk import (
     PEAK_ACCELERATION,
     PEAK_JERK,
@@ -153,7 +153,7 @@ def test_target_that_is_not_finite_leaves_the_old_one(bad):
 
 def test_parameters_of_zero_mean_no_limit():
     zeros = dict.fromkeys(("max_velocity", "max_acceleration", "max_jerk"), 0.0)
-    assert settings_of(ProfileLimits, zeros) == ProfileLimits()
+    assert build_settings(ProfileLimits, zeros) == ProfileLimits()
 
 
 drives = st.builds(

@@ -23,7 +23,7 @@ ROUNDING = 1e-9
 
 @given(v=st.floats(-3.0, 3.0), w=st.floats(-6.0, 6.0))
 def test_path_keeps_its_shape_when_a_wheel_cannot_follow(v, w):
-    left, right = ROBOT.reachable_wheel_speeds(v, w)
+    left, right = ROBOT.limit_wheel_speeds(v, w)
     assert max(abs(left), abs(right)) <= 3.0 * (1.0 + ROUNDING)
     linear, angular = ROBOT.body_velocity(left, right)
     # The same curvature, w/v, written without division.
@@ -32,7 +32,7 @@ def test_path_keeps_its_shape_when_a_wheel_cannot_follow(v, w):
 
 
 def test_command_within_reach_is_not_touched():
-    assert ROBOT.reachable_wheel_speeds(0.1, 0.2) == ROBOT.wheel_speeds(0.1, 0.2)
+    assert ROBOT.limit_wheel_speeds(0.1, 0.2) == ROBOT.wheel_speeds(0.1, 0.2)
 
 
 def test_radius_multipliers_act_on_their_side():

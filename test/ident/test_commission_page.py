@@ -13,7 +13,7 @@ from browser import CHROMIUM, Browser
 from results import estimate
 
 from smp_motor_control import WHEELS
-from smp_motor_ident.cli.protocol import Protocol
+from smp_motor_ident.cli.commissioning_log import CommissioningLog
 from smp_motor_ident.commission.wheel_test import Figures
 from smp_motor_ident.report.document import identification_document
 from smp_motor_ident.result import Share, to_json
@@ -53,7 +53,7 @@ def passed(tmp_path: Path) -> Path:
     (tmp_path / "gains.json").write_text(json.dumps({"wheels": dict.fromkeys(WHEELS, entry)}))
     nodes = {f"/**/{wheel}/wheel_pid": {"ros__parameters": GAINS} for wheel in WHEELS}
     (tmp_path / "gains.yaml").write_text("# designed by tune\n" + yaml.safe_dump(nodes))
-    made = Protocol(tmp_path)
+    made = CommissioningLog(tmp_path)
     made.begin(WHEELS, {})
     made.checks(dict.fromkeys(WHEELS, FIGURES), 6.0, 1.6)
     made.changes(
@@ -116,7 +116,7 @@ def test_no_table_is_cut_and_the_page_does_not_scroll_sideways(passed, tmp_path,
 
 
 def test_gains_that_have_not_driven_are_not_called_passed(passed, tmp_path):
-    made = Protocol(passed)
+    made = CommissioningLog(passed)
     made.changes([])
     made.end(False, "stopped: a wheel settles late")
     with Browser(tmp_path / "profile") as browser:

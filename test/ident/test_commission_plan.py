@@ -56,7 +56,7 @@ class Steps:
         self.bounds, self.sent = dict[str, object](), list[Any]()
         self.more: plan.Recording | None = None
         self.estimate = make_estimate("left")
-        monkeypatch.setattr(plan, "plan_further", lambda *_: self.more)
+        monkeypatch.setattr(plan, "plan_extra_recording", lambda *_: self.more)
         monkeypatch.setattr(commissioning, "connect", self.connect)
         monkeypatch.setattr(steps, "record", self.record)
         for owner, name, called in (
@@ -68,7 +68,7 @@ class Steps:
         monkeypatch.setattr(steps, "identify_wheels", self.identify)
         monkeypatch.setattr(steps, "tune_wheels", self.tune)
         monkeypatch.setattr(checking, "check_wheels", self.check)
-        monkeypatch.setattr(commissioning, "too_hot", lambda *_: self.heat)
+        monkeypatch.setattr(commissioning, "find_hot_windings", lambda *_: self.heat)
 
     def connect(self, *_: object) -> Client:
         self.left = self.fuel
@@ -94,9 +94,9 @@ class Steps:
         (output / "identification.json").write_text(text)
         return estimates
 
-    def check(self, *_: object) -> checking.Checked:
+    def check(self, *_: object) -> checking.CheckResult:
         self.step("check")
-        return checking.Checked(self.found, {"left": FIGURES}, 4.0, 1.6)
+        return checking.CheckResult(self.found, {"left": FIGURES}, 4.0, 1.6)
 
     def record(self, robot: object, name: str) -> Path:
         (self.folder / name).mkdir()  # as record does, which refuses a folder that is there
@@ -254,8 +254,8 @@ def test_the_remaining_time_follows_the_duration_of_similar_parts():
     robots = [plan.Recording("excitation", name, steps.Excitation(name, 10.0, 6.0))
               for name in ("sine", "square")]  # fmt: skip
     schedule = plan.schedule(["left"], robots, checked=True)
-    compute = 2 * plan.COMPUTE + plan.DRIVE
-    assert schedule.left() == pytest.approx(2 * (10.0 + plan.START) + compute)
+    compute = 2 * plan.COMPUTE_S + plan.DRIVE_S
+    assert schedule.left() == pytest.approx(2 * (10.0 + plan.START_S) + compute)
     assert schedule.begin("exciting: sine", "6 V").startswith("[1/5] exciting: sine, 6 V; about ")
     timed = plan.Schedule(lambda: now[0])
     for name, kind in (("a", "x"), ("b", "x"), ("c", "y")):
@@ -272,12 +272,12 @@ def test_the_remaining_time_follows_the_duration_of_similar_parts():
 
 def test_a_motor_that_is_not_known_well_enough_is_recorded_once_more():
     known = make_estimate()  # to a percent, and the gain better
-    assert plan.plan_further({"left": known}, 6.0) is None
+    assert plan.plan_extra_recording({"left": known}, 6.0) is None
     vague = replace(known.combinations["time_constant"], std=0.002)  # 5 %
     open_ = replace(known, combinations={**known.combinations, "time_constant": vague})
-    more = plan.plan_further({"left": known, "right": open_}, 6.0)
+    more = plan.plan_extra_recording({"left": known, "right": open_}, 6.0)
     assert more is not None and more.folder == "excitation" and more.name == "further"
     sent = more.excitation
     assert sent.signal == "fourier" and sent.amplitude <= 6.0 and sent.band is not None
     # The tones lie around the motor's corner, 4 Hz.
-    assert sent.band[0] < 4.0 < sent.band[1] and 5.0 <= sent.duration <= plan.MAX_FURTHER_S
+    assert sent.band[0] < 4.0 < sent.band[1] and 5.0 <= sent.duration <= plan.MAX_EXTRA_S

@@ -46,9 +46,9 @@ class Robot:
         if self.left < 0:
             raise KeyboardInterrupt
 
-    def check(self, *_: object) -> checking.Checked:
+    def check(self, *_: object) -> checking.CheckResult:
         self.use()
-        return checking.Checked((), {WHEEL: FIGURES}, 6.0, math.nan)
+        return checking.CheckResult((), {WHEEL: FIGURES}, 6.0, math.nan)
 
     def record(self, robot: steps.Robot, name: str) -> None:
         self.draft = robot.folder / name

@@ -54,19 +54,21 @@ def test_a_drive_settles_as_tune_predicts(tmp_path):
     assert [(m.name, m.before, m.setpoint) for m in moves] == [
         ("straight", 0.0, 2.0), ("arc", 2.0, 1.0), ("spin", 1.0, -2.0), ("stop", -2.0, 0.0),
     ]  # fmt: skip
-    changes, _ = driving.changes_of(WHEEL, driving.Driven(state, answers), moves, given)
+    changes, _ = driving.evaluate_changes(
+        WHEEL, driving.DriveRecording(state, answers), moves, given
+    )
     for one in changes:
         # Another size of change, with counts and a speed read from them: two samples.
         assert abs(one.reading.settling - stated["value"]) <= 2 * STEP
         assert abs(one.reading.settling - one.expected.settling) <= STEP
         assert one.reading.overshoot < 1.0
     # A wheel that lags behind is seen: the same drive, a tenth of a second late.
-    late = driving.Driven(table(run.time + 0.1, **state.columns), answers)
-    (behind, *_), _ = driving.changes_of(WHEEL, late, moves, given)
+    late = driving.DriveRecording(table(run.time + 0.1, **state.columns), answers)
+    (behind, *_), _ = driving.evaluate_changes(WHEEL, late, moves, given)
     assert behind.reading.settling - stated["value"] > 0.05
     # A clock that was set before the drive ended: a line, and no memory for the years between.
     early = np.where(run.time < 0.5, 0.0, 1.7e9) + run.time
-    torn = driving.Driven(table(early, **state.columns), table(early, **answers.columns))
+    torn = driving.DriveRecording(table(early, **state.columns), table(early, **answers.columns))
     wide = [replace(one, begin=one.begin + 1.7e9) for one in moves]
     with pytest.raises(ProcessError, match="a clock was set"):
-        driving.changes_of(WHEEL, torn, wide, given)
+        driving.evaluate_changes(WHEEL, torn, wide, given)

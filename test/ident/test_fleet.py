@@ -70,12 +70,12 @@ def fake(path: str, settings: tuple[Any, ...]) -> list[Row]:
         log.write(Path(path).name + "\n")
     text = Path(path).read_text()
     if text == "broken":
-        return [command._row(path, failure=f"{path}: is not a recording")]
+        return [command._make_row(path, failure=f"{path}: is not a recording")]
     killed = Path(path + ".killed")
     if text == "deadly" and not killed.exists():
         killed.touch()
         os.kill(os.getpid(), signal.SIGKILL)
-    return [command._row(path, wheel="left", values={"dc_gain": gain(25.0)}, fit_percent=97.0)]
+    return [command._make_row(path, wheel="left", values={"dc_gain": gain(25.0)}, fit_percent=97.0)]
 
 
 def test_a_broken_bag_and_a_killed_worker_lose_no_other_result(tmp_path, monkeypatch):

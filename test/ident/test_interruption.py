@@ -62,7 +62,7 @@ def test_a_protected_block_is_completed_before_an_interruption():
     done: list[str] = []
 
     def work() -> None:
-        with interruption.held():
+        with interruption.delayed():
             os.kill(os.getpid(), signal.SIGTERM)
             done.append("all of it")
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from smp_motor_ident.bag.window import Window
-from smp_motor_ident.live.demands import missing
+from smp_motor_ident.live.demands import find_missing_excitation
 from smp_motor_ident.record import Hardware
 
 RATIO, COUNTS, STEP = 65.5, 500.0, 0.005
@@ -54,7 +54,7 @@ def test_voltages_that_differ_by_a_rounding_are_one_level():
     for volts in (12.0, -3.3, 1e-3):
         voltage = np.full(2000, volts)
         voltage[::7] = np.nextafter(volts, np.inf)
-        lacks = missing(filled(10.0, voltage).record())
+        lacks = find_missing_excitation(filled(10.0, voltage).record())
         assert "1 of 3 levels of voltage" in lacks
 
 
@@ -63,7 +63,7 @@ def test_an_impossible_voltage_is_not_a_sample(volts):
     window = filled(20.0)
     before = len(window)
     window.add(NOW + 20 * SECOND, state(volts, np.nan, 0.0, 0.0, 0))
-    assert len(window) == before and missing(window.record()) == []
+    assert len(window) == before and find_missing_excitation(window.record()) == []
 
 
 def test_window_keeps_only_its_length():
@@ -112,7 +112,7 @@ def test_samples_without_voltage_are_left_out():
 
 
 def test_rich_motion_meets_every_demand():
-    assert missing(filled(10.0).record()) == []
+    assert find_missing_excitation(filled(10.0).record()) == []
 
 
 @pytest.mark.parametrize(
@@ -126,20 +126,20 @@ def test_rich_motion_meets_every_demand():
     ],
 )
 def test_missing_excitation_is_named(seconds, voltage, word):
-    assert word in "; ".join(missing(filled(seconds, voltage).record()))
+    assert word in "; ".join(find_missing_excitation(filled(seconds, voltage).record()))
 
 
 def test_nothing_heard_is_named():
-    assert missing(Window("w", 5.0).record()) == ["no motor_state yet"]
+    assert find_missing_excitation(Window("w", 5.0).record()) == ["no motor_state yet"]
 
 
 def test_demands_do_not_depend_on_the_unit_of_speed():
     record = filled(10.0).record()
     slow = replace(record, velocity=record.velocity * 1e-6, count=None)
-    assert missing(slow) == missing(record) == []
+    assert find_missing_excitation(slow) == find_missing_excitation(record) == []
 
 
 def test_demands_are_met_without_a_speed():
     record = filled(10.0).record()
     for way in ({"count": None}, {"position": None, "hardware": Hardware()}):
-        assert missing(replace(record, velocity=None, **way)) == []
+        assert find_missing_excitation(replace(record, velocity=None, **way)) == []

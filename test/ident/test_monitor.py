@@ -10,11 +10,11 @@ import pytest
 from scipy.linalg import expm
 
 from smp_motor_ident.errors import BagError, ParameterError
-from smp_motor_ident.live.monitor import Commissioned, Monitor, commissioned_of
+from smp_motor_ident.live.monitor import CommissionedValues, Monitor, read_commissioned_values
 from smp_motor_ident.report import history
 from smp_motor_ident.result import Estimate
 
-MOTOR = Commissioned(12.919, 0.30994, 0.011029, 1.13e-6, 2.4e-5, 3.8417e-4, 12.0)
+MOTOR = CommissionedValues(12.919, 0.30994, 0.011029, 1.13e-6, 2.4e-5, 3.8417e-4, 12.0)
 COUNT = 2 * math.pi / 500
 STEP = 0.01
 
@@ -191,4 +191,4 @@ def test_a_history_reads_back_but_for_a_line_that_was_cut(tmp_path):
 def test_a_motor_without_a_measured_current_cannot_be_watched():
     found = Estimate(wheel="left", model="second_order", parameters={}, combinations={})
     with pytest.raises(ParameterError, match="current"):
-        commissioned_of(found)
+        read_commissioned_values(found)

@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 from wheel_simulation import Run, Timing, simulate_closed_loop
 
-from smp_motor_control.fields import parameters_in
-from smp_motor_control.fields import settings_of as settings_of_parameters
+from smp_motor_control.fields import build_settings, parameters_in
 from smp_motor_control.motor.file import load_motors
 from smp_motor_control.motor.hardware import DrivenMotor, DriveSettings
 from smp_motor_control.motor.parameters import MotorModel
@@ -146,7 +145,7 @@ def test_gains_for_a_slow_loop_drive_its_wheel(estimates, rate):
     one = design(estimates["front_left"], Loop(sample_time=T))
     written = flatten(parameters(one))
     values = {name: field.default for name, field in parameters_in(WheelSettings).items()}
-    settings = settings_of_parameters(WheelSettings, {**values, **written})
+    settings = build_settings(WheelSettings, {**values, **written})
     wheel = WheelController(WheelSettings())
     wheel.check(settings)
     wheel.configure(settings)

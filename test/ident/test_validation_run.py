@@ -3,17 +3,17 @@
 
 import numpy as np
 
-from smp_motor_ident.commission.validation_run import Simulated, judge
+from smp_motor_ident.commission.validation_run import SimulatedRun, judge
 
 TIME = np.arange(0.0, 10.0, 0.005)
 SPEED = 100.0 * np.sin(2.0 * TIME)
 
 
-def run(seed: int, error: float, gain: float = 1.0) -> Simulated:
+def run(seed: int, error: float, gain: float = 1.0) -> SimulatedRun:
     """Return a run whose simulation is off by noise that lasts for a while, and by a gain."""
     draw = np.random.default_rng(seed)
     slow = np.convolve(draw.normal(size=TIME.size + 99), np.ones(100) / 10.0, "valid")
-    return Simulated(TIME, gain * SPEED + error * slow, SPEED)
+    return SimulatedRun(TIME, gain * SPEED + error * slow, SPEED)
 
 
 def test_a_motor_that_did_not_change_is_stated_and_rarely_refused():

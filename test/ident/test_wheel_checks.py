@@ -13,10 +13,10 @@ from smp_motor_ident.commission.wheel_test import (
     Figures,
     Phase,
     Trace,
-    answers_well,
     count_coupled_motion,
     figures,
     has_settled,
+    responds_clearly,
 )
 from smp_motor_ident.record import Hardware
 
@@ -181,9 +181,9 @@ def test_a_wheel_that_drags_is_separated_from_motors_that_scatter():
 
 
 def test_the_voltage_grows_until_friction_is_a_tenth_and_counts_are_enough():
-    assert answers_well(5.0, 0.5, 100.0)
-    assert not answers_well(4.9, 0.5, 1000.0)
-    assert not answers_well(5.0, 0.5, 99.0)
+    assert responds_clearly(5.0, 0.5, 100.0)
+    assert not responds_clearly(4.9, 0.5, 1000.0)
+    assert not responds_clearly(5.0, 0.5, 99.0)
 
 
 def test_samples_that_wait_in_a_queue_show_the_same_motor():

@@ -20,7 +20,7 @@ from std_srvs.srv import Trigger
 
 from smp_motor_control.errors import ParameterError
 from smp_motor_control.fields import described
-from smp_motor_control.nodes.executor import LeanExecutor, OwnerReads, _WaitSet
+from smp_motor_control.nodes.executor import LeanExecutor, PolledSubscriptions, _WaitSet
 from smp_motor_control.nodes.runtime import STREAM_PUBLISHER, STREAM_SUBSCRIBER, steady_timer
 from smp_motor_control.nodes.settings import Parameters
 
@@ -173,7 +173,7 @@ def test_messages_taken_by_their_owner_wake_no_executor(context, executor):
     node = rclpy.create_node("batches", context=context)
     executor.add_node(node)
     kept = node.create_subscription(
-        Float64, "batch", lambda _: None, STREAM_SUBSCRIBER, callback_group=OwnerReads()
+        Float64, "batch", lambda _: None, STREAM_SUBSCRIBER, callback_group=PolledSubscriptions()
     )
     publisher = node.create_publisher(Float64, "batch", STREAM_PUBLISHER)
     spin_until(executor, node, lambda: publisher.get_subscription_count() == 1)

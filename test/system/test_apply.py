@@ -238,7 +238,7 @@ def test_relay_on_a_running_wheel_gives_gains_without_a_model(process, robot, ev
     response = 1 / (m.a2 * w**2 + m.a1 * w + m.a0) / motor.gearbox.ratio
     assert ultimate * abs(response) == pytest.approx(1.0, rel=0.1)
     # The loop lags by a sample of latching, half of hold and half of averaging at least, so it
-    # cannot oscillate faster than the model does with these; nor, while it is a loop at all,
+    # cannot run_relay_test faster than the model does with these; nor, while it is a loop at all,
     # slower than with a fifth of a second, at which wheel_pid itself calls feedback lost.
     assert period_with(m, 2 * PERIOD) / 1.15 < period < period_with(m, 0.2)
     # The controller has the wheel again.

@@ -25,7 +25,7 @@ SUMMARY = ("DC gain", "Time constant", "Static voltage", "p", "i", "d", "Settles
 """Rows of the page that the terminal shows."""
 
 
-class Protocol:
+class CommissioningLog:
     """Findings, figures and verdict in ``commissioning.json`` and a page; resumed if present."""
 
     def __init__(self, folder: Path, accepted: Sequence[str] = ()) -> None:
@@ -55,7 +55,7 @@ class Protocol:
         self.document |= done
 
     def checks(self, figures: Mapping[str, Figures], amplitude: float, speed: float) -> None:
-        """Record the results of the wheel checks, see :class:`~.checking.Checked`."""
+        """Record the results of the wheel checks, see :class:`~.checking.CheckResult`."""
         self.document |= plain({"checks": figures, "amplitude": amplitude, "speed": speed})
 
     def changes(self, changes: Sequence[Change]) -> None:
