@@ -32,18 +32,18 @@ SIZES = {"wheel_separation": "separation", "wheel_radius": "radius"}
 CONFIG = [FindPackageShare(PACKAGE), "/config/"]
 
 ARGUMENTS = {
-    "namespace": ("", "Of the robot, such as robot1"),
+    "namespace": ("", "Namespace of the robot, such as robot1"),
     "hardware": ("simulated", "simulated: motor_plant; external: your driver runs"),
     "left_wheels": ("", f"Names of the left wheels; else those of body, else {','.join(LEFT)}"),
     "right_wheels": ("", f"Names of the right wheels; else those of body, else {','.join(RIGHT)}"),
-    "params_file": ([*CONFIG, "gains.yaml"], "Parameters of the wheels: what tune writes"),
+    "params_file": ([*CONFIG, "gains.yaml"], "Parameters of the wheels, as written by tune"),
     "body": ([*CONFIG, "skid_steer.yaml"], "Parameters of skid_steer"),
     "motors": ([*CONFIG, "motors_paper.yaml"], "Motors of the simulation"),
     "rate": ("200.0", "Samples per second of the simulation"),
-    "skid_steer": ("true", "Whether to start skid_steer"),
-    "description": ("true", "Whether robot_state_publisher, where it is installed, gets a URDF"),
-    "use_stamped_vel": ("true", "Whether TwistStamped goes before Twist where both are published"),
-    "autostart": ("true", "Whether the wheels' controllers activate themselves"),
+    "skid_steer": ("true", "Start skid_steer"),
+    "description": ("true", "Start robot_state_publisher, if it is installed"),
+    "use_stamped_vel": ("true", "Prefer TwistStamped to Twist if both are published"),
+    "autostart": ("true", "Activate the wheels' controllers at start"),
     "use_sim_time": ("false", "Take the time from /clock"),
     "log_level": ("info", "debug, info, warn, error"),
 }
@@ -94,19 +94,15 @@ def start(context, *_) -> list:
         nodes.append(node("skid_steer", [given["body"], body]))
         if is_true(given, "description"):
             nodes += describe(sides, geometry, robot, common)
-    if given["hardware"] == "external" and Path(given["params_file"]) == paper_gains(context):
+    paper_gains = Path(FindPackageShare(PACKAGE).perform(context), "config", "gains.yaml")
+    if given["hardware"] == "external" and Path(given["params_file"]) == paper_gains:
         nodes.append(LogInfo(msg=f"{given['params_file']}: gains for the motors of the paper; "
                                  "params_file:= gives yours"))  # fmt: skip
     return nodes
 
 
-def paper_gains(context) -> Path:
-    """Return the file that is taken where none is given."""
-    return Path(*(FindPackageShare(PACKAGE).perform(context), "config", "gains.yaml"))
-
-
 def describe(sides: list, geometry: dict, robot: str, common: dict) -> list:
-    """Return what turns joint_states into the frames of the wheels."""
+    """Return the actions that publish the frames of the wheels."""
     if not any(Path(p, STATE_PUBLISHER).is_dir() for p in get_search_paths()):
         return [LogInfo(msg="robot_state_publisher is not installed: no frames of the wheels")]
     sizes = {to: geometry[name] for name, to in SIZES.items() if name in geometry}
@@ -123,7 +119,7 @@ def describe(sides: list, geometry: dict, robot: str, common: dict) -> list:
 
 
 def number(given: dict, name: str) -> float:
-    """Return a number."""
+    """Return a numeric argument."""
     try:
         return float(given[name])
     except ValueError:
@@ -131,7 +127,7 @@ def number(given: dict, name: str) -> float:
 
 
 def is_true(given: dict, name: str) -> bool:
-    """Return a switch."""
+    """Return a boolean argument."""
     value = given[name].lower()
     if value not in ("true", "false"):
         raise RuntimeError(f"{name} is {given[name]!r}; it must be true or false")

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Drives in segments of the body, or of the wheels without skid_steer, that end with zero."""
+"""Timed drives of the body or, without skid_steer, of the wheels; each ends with zero commands."""
 
 import time
 from collections.abc import Callable, Sequence
@@ -92,11 +92,11 @@ def _command_standstill(
         if message.setpoint == 0.0:
             heard[wheel] = time.monotonic()
 
-    followed = time.monotonic() + STANDSTILL_S
+    settled = time.monotonic() + STANDSTILL_S
     with client.listen_to_wheels(PidState, "pid_state", wheels, take):
-        while time.monotonic() < followed or min(heard.values()) < followed:
-            if time.monotonic() > followed + TIMEOUT_S:
-                silent = [f"{w}/pid_state" for w in wheels if heard[w] < followed]
+        while time.monotonic() < settled or min(heard.values()) < settled:
+            if time.monotonic() > settled + TIMEOUT_S:
+                silent = [f"{w}/pid_state" for w in wheels if heard[w] < settled]
                 raise RobotError(
                     f"no message on {', '.join(silent)} at standstill; is wheel_pid active?"
                 )
@@ -115,6 +115,6 @@ def _refuse_other_senders(client: RobotClient) -> None:
         client.until(lambda: bool(heard), QUIET_TIME_S)
     if heard:
         topic = client.node.resolve_topic_name("wheel_setpoints")
-        named = client.node.get_publishers_info_by_topic(topic)
-        who = ", ".join(sorted({one.node_name for one in named})) or "another node"
+        senders = client.node.get_publishers_info_by_topic(topic)
+        who = ", ".join(sorted({one.node_name for one in senders})) or "another node"
         raise RobotError(f"wheel_setpoints: {who} drives the wheels; stop it first")

@@ -22,8 +22,8 @@ WINDOW_S = 0.4  # assessed time span; the first assessment is this long after th
 MAX_SILENT_POLLS = 25
 """Polls without a report that show a stopped loop: half a second of this process's run time."""
 
-STARVED_RATIO = 10.0  # a step that comes so many usual steps late ran without control meanwhile
-RETURN_TIMEOUT_S = 60.0  # for a wheel that does not answer
+STARVED_RATIO = 10.0  # late by this many usual intervals, the loop was not computed meanwhile
+RETURN_TIMEOUT_S = 60.0  # longest wait for a wheel that stopped answering
 
 
 class LoopWatch:
@@ -80,11 +80,11 @@ class LoopWatch:
         if any(max(s.dt, s.age) > STARVED_RATIO * self.baseline_dt for s in states):
             return None  # the computer's delays, not the gains, affect the speed
         error = _rms([s.error for s in states])
-        asked = max(abs(s.reference) for s in states)
-        moved = max(s.reference for s in states) - min(s.reference for s in states)
+        largest = max(abs(s.reference) for s in states)
+        change = max(s.reference for s in states) - min(s.reference for s in states)
         # A lag behind a moving reference is not a fault.
-        if error > max(0.3 * asked + moved, 3 * self.baseline_error, 0.1):
-            return f"its speed is {error:.2g} rad/s off at {asked:.2g} rad/s"
+        if error > max(0.3 * largest + change, 3 * self.baseline_error, 0.1):
+            return f"its speed is {error:.2g} rad/s off at {largest:.2g} rad/s"
         return None
 
 
@@ -102,7 +102,7 @@ class Outcome:
     """Result of a trial."""
 
     reason: str  # why the old gains were restored; empty if the new ones are kept
-    after: float  # time until this was done in the wheels that answered [s]
+    after: float  # time from the change to their restoration, without missing wheels [s]
     missing: tuple[str, ...] = ()  # wheels that did not answer and may run with the new gains
 
 
@@ -112,11 +112,11 @@ def try_gains(
     trial: float,
     supply: float,
     say: Callable[[str], None] = print,
-    begun: Callable[[], None] = lambda: None,
+    on_set: Callable[[], None] = lambda: None,
 ) -> Outcome:
     """Set parameters in all wheels, watch the loops, and restore all when one misbehaves.
 
-    ``begun`` is called once the parameters are set.
+    ``on_set`` is called once the parameters are set.
     """
     watches = {wheel: LoopWatch(supply) for wheel in values}
     with client.listen(PidState, {f"{w}/pid_state": one.take for w, one in watches.items()}):
@@ -136,11 +136,12 @@ def try_gains(
             one.begin()
         start = time.monotonic()
         pending_restore = dict(client.pending_restore)
-        gains = {**old, **pending_restore.get("gains", {})}  # those of an earlier trial are older
+        # Gains that an earlier trial has replaced are the ones to restore.
+        gains = {**old, **pending_restore.get("gains", {})}
         client.set_pending_restore(**{**pending_restore, "gains": gains})
         try:
             client.set_parameters({get_controller_name(w): new for w, new in values.items()})
-            begun()
+            on_set()
             reason = _watch(client, watches, trial)
         except RobotError as error:
             reason = str(error)

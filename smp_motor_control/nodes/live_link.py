@@ -32,9 +32,9 @@ SLOT_S = 0.005  # interval of the common time grid; the last sample in it counts
 MAX_LATE_SLOTS = 4  # delay of one wheel's samples after another's [slots]
 MAX_OFFSET_SLOTS = 200  # longest lag of a stream; a longer one shows a clock that was set
 FRAME_S = 1 / 30  # period of batches and of commands
-HISTORY_S = 60.0  # length of the kept history
-COMMAND_TIMEOUT_S = 0.3  # age at which a command ends
-WATCH_TIMEOUT_S = 0.5  # longest time for which nobody may watch the sender of commands
+HISTORY_S = 60.0  # length of the stored history
+COMMAND_TIMEOUT_S = 0.3  # age at which a command expires
+WATCH_TIMEOUT_S = 0.5  # longest time between two checks of the page that drives
 BODY_TIMEOUT_S = 0.6  # from the last command to the body until skid_steer is idle
 ZERO_TIME_S = 1.0  # duration of zero commands after a drive
 DIAGNOSTICS_TIMEOUT_S = 3.0  # age at which a report is dropped
@@ -113,7 +113,7 @@ class LiveLink:
         self.hardware: dict[str, MotorDescription] = {}
         self.diagnostics: dict[str, tuple[float, int, str]] = {}
         self.armed = self.controlled = False  # whether commands pass; controllers are active
-        self.watched_at = -math.inf  # when it was last known that the sender of commands lives
+        self.watched_at = -math.inf  # time of the last check of the page that drives
         self._halt, self.halts = "", 0  # reason of a halt that is due; number of halts
         self._plans: tuple[float, Mapping[str, Plan], float] | None = None
         self._body = (0.0, 0.0, -math.inf)  # m/s, rad/s, when commanded
@@ -177,7 +177,7 @@ class LiveLink:
     def _on_timer(self) -> None:
         now = time.monotonic()
         if self.armed and now - self.watched_at > WATCH_TIMEOUT_S:
-            self.halt(f"nobody watched the page for {WATCH_TIMEOUT_S:g} s")
+            self.halt(f"the page was not checked for {WATCH_TIMEOUT_S:g} s")
         if self._halt:
             self._stop_wheels()
         linear, angular, at = self._body
@@ -197,7 +197,7 @@ class LiveLink:
         try:
             self._read()
             self._listener.on_tick()
-        except Exception as error:  # the wheels are still to be stopped
+        except Exception as error:  # keep running, to stop the wheels
             self.halt(f"the streams failed with {error!r}")
 
     def _read(self) -> None:
@@ -216,7 +216,7 @@ class LiveLink:
     def _stop_wheels(self) -> None:
         reason, self._halt = self._halt, ""
         if not (self.armed or self.controlled):
-            return  # others may drive the wheels
+            return  # the wheels are not ours to stop
         self.armed, self._plans = False, None
         self._body = (0.0, 0.0, self._body[2])  # zero for as long as it would have driven
         self._send_setpoints({})

@@ -307,8 +307,8 @@ class RobotClient:
                 states = self.get_states(left)
                 left = [node for node in left if states[node] != _RESULTING_STATE[transition]]
         if left:
-            said = ", ".join(f"{self._absolute_name(node)} ({states[node]})" for node in left)
-            raise RobotError(f"refused to {transition}: {said}")
+            listed = ", ".join(f"{self._absolute_name(node)} ({states[node]})" for node in left)
+            raise RobotError(f"refused to {transition}: {listed}")
 
     def set_pending_restore(self, **pending_restore: Any) -> None:
         """Note the state to restore, before it is changed.
@@ -323,14 +323,14 @@ class RobotClient:
             self._guard.note(pending_restore)
 
     def prepare(self, pending_restore: Mapping[str, Any]) -> None:
-        """Get known to the controllers that :meth:`restore` halts, which takes time."""
+        """Connect to the controllers that :meth:`restore` halts; discovery takes time."""
         for name in _deactivation_requests(pending_restore):
             self._client(ChangeState, name)
 
     def restore(self, pending_restore: Mapping[str, Any]) -> None:
         """Halt the wheels, set the previous gains and activate the controllers that were active."""
         if pending_restore.get("halt"):
-            with contextlib.suppress(RobotError):  # one that is missing keeps no other moving
+            with contextlib.suppress(RobotError):  # a missing controller must not prevent the rest
                 self.call_services(ChangeState, _deactivation_requests(pending_restore), HALT_S)
             self.spin(HALT_S)
         if pending_restore.get("gains"):

@@ -34,7 +34,7 @@ from smp_motor_control.nodes.settings import Parameters
 POLL_PERIOD_S = 0.002
 SILENCE_S = 0.5  # of a board, after which its line is reopened
 COMMAND_PERIOD_S = 0.05  # longest interval between two commands; the board stops after 0.2 s
-BOARD_TIMEOUT_S = 0.2  # a board that was silent for so long is told nothing: it may not read
+BOARD_TIMEOUT_S = 0.2  # silence of a board after which it gets no commands: it may not read
 STALE_AFTER_S = 0.1  # age at which an unsent command is dropped
 EMPTY_RATIO = 0.3  # supply over nominal below which a battery is empty or off
 OVERCHARGED_RATIO = 2.0  # supply over nominal above which a board's reading is wrong
@@ -256,7 +256,7 @@ class SerialDriver(Node):
         now = time.monotonic()
         values: dict[str, object] = {
             "battery [V]": self._battery,
-            "spoilt lines": self._damaged,
+            "damaged lines": self._damaged,
             "resets of the board": self._resets,
             "openings": self._openings,
             "dropped commands": self._dropped,

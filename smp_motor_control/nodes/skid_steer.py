@@ -145,7 +145,7 @@ class SkidSteerNode(Node):
             self._others_at = time.monotonic()
 
     def _should_yield(self, now: float) -> bool:
-        """Return whether the body stands by its command, and another node sends set-points."""
+        """Return whether the body is idle while another node sends set-points."""
         idle = self._command.timed_out(now) and not any(self._past_commands[0])
         return idle and now - self._others_at < YIELD_S
 
@@ -217,7 +217,7 @@ class SkidSteerNode(Node):
 
     def _limit(self, asked: tuple[float, float], dt: float, now: float) -> tuple[float, float]:
         """Return the command limited by acceleration, jerk and the stop rule."""
-        self._stop.ask(max(map(abs, asked)), now)
+        self._stop.note_setpoint(max(map(abs, asked)), now)
         if self._stop.is_overdue(now, self._current.settings.stop_time):
             return 0.0, 0.0
         (v0, w0), (v1, w1) = self._past_commands

@@ -184,7 +184,7 @@ class WheelController:
             # The feed-forward of friction is the same however small the set-point is.
             self.setpoint = value if abs(value) > STANDSTILL_SETPOINT else 0.0
             self._setpoint_at = now
-            self._stop.ask(value, now)
+            self._stop.note_setpoint(value, now)
 
     def take_feedback(self, sample: Sample, stamp: int, arrival: int, now: float) -> float | None:
         """Process a sample with its stamp and arrival [ns]; return the voltage [V] or None."""
@@ -359,7 +359,7 @@ class WheelController:
         self._expired = silent > 0.0
         if not self._expired:
             return self.setpoint
-        self._stop.ask(0.0, now - silent)
+        self._stop.note_setpoint(0.0, now - silent)
         stopped = self.loop.reference.velocity == 0.0 and abs(measurement) < REST_SPEED
         if stopped or self._stop.is_overdue(now, settings.loop.stop_time):
             self.setpoint = None

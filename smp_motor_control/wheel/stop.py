@@ -36,7 +36,7 @@ class StopRule:
         """Whether the set-point is zero."""
         return self._since < math.inf
 
-    def ask(self, setpoint: float, now: float) -> None:
+    def note_setpoint(self, setpoint: float, now: float) -> None:
         """Note a set-point [rad/s]."""
         if abs(setpoint) > STANDSTILL_SETPOINT:
             self._since = math.inf

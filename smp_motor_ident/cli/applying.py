@@ -23,7 +23,7 @@ def apply(wanted: Mapping[str, Mapping[str, Any]], arguments: argparse.Namespace
         found = robot.get_parameters(
             {get_controller_name(w): list(new) for w, new in wanted.items()}
         )
-        new = _changes({wheel: found[get_controller_name(wheel)] for wheel in wanted}, wanted)
+        new = _print_changes({wheel: found[get_controller_name(wheel)] for wheel in wanted}, wanted)
         if not any(new.values()):
             print("the running gains are these already: nothing to set")
             return 0
@@ -51,7 +51,7 @@ def from_file(path: Path) -> dict[str, dict[str, Any]]:
     return found
 
 
-def _changes(
+def _print_changes(
     old: Mapping[str, Mapping[str, Any]], wanted: Mapping[str, Mapping[str, Any]]
 ) -> dict[str, dict[str, Any]]:
     """Print and return the changes."""

@@ -22,9 +22,9 @@ from smp_motor_ident.finding import Finding
 from smp_motor_ident.record import Hardware
 
 REST_S, COAST_S = 0.3, 0.4  # zero voltage before and after [s]; a coast of a few time constants
-MAX_HOLD_S = 2.0  # a voltage is held for so long where the wheel is slow [s]
-RAMP_RATE = 0.15  # growth of the voltage until the wheel turns [of the supply per second]
-LEVEL_RATIO = 2.0  # of the voltage from one level to the next
+MAX_HOLD_S = 2.0  # longest time for which a voltage is held [s]
+RAMP_RATE = 0.15  # rate of the voltage ramp, relative to the supply [1/s]
+LEVEL_RATIO = 2.0  # ratio of successive voltage levels
 FIRST_LEVEL = (1.5, 0.05)
 """First level: multiple of the starting voltage, plus a share of the supply."""
 
@@ -44,7 +44,7 @@ class CheckResult:
 
 @dataclass
 class _WheelUnderTest:
-    """A wheel under test: its driving process and its completed phases."""
+    """One wheel of a running test, with its completed phases."""
 
     test: Any
     wheel: str
@@ -69,7 +69,7 @@ class _WheelUnderTest:
             self.limit / rate,
             lambda: tape.turned(first) >= TURNING_COUNTS,
         )
-        # Two levels at least tell friction from gain.
+        # At least two levels are needed to separate friction and gain.
         level = FIRST_LEVEL[0] * abs(start) + FIRST_LEVEL[1] * self.supply
         level = min(level, 0.5 * (abs(start) + self.limit))
         while tape.turned(first) >= TURNING_COUNTS:
@@ -81,7 +81,7 @@ class _WheelUnderTest:
         self.phase("coast", lambda t: 0.0, COAST_S, None)
 
     def _hold(self, voltage: float) -> None:
-        """Hold a voltage until the wheel has has_settled."""
+        """Hold a voltage until the wheel has settled."""
         rows = self.test.recordings[self.wheel].rows
         since = len(rows)
         self.phase(
@@ -100,9 +100,10 @@ def check_wheels(
     """Test the wheels one by one, at most at ``limit`` volts, and check their responses."""
     from smp_motor_control.nodes import wheel_test
 
-    said = wheel_test.read_descriptions(client, wheels, TIMEOUT_S)
+    described = wheel_test.read_descriptions(client, wheels, TIMEOUT_S)
     hardware = {
-        wheel: convert_description(said[wheel]) if wheel in said else Hardware() for wheel in wheels
+        wheel: convert_description(described[wheel]) if wheel in described else Hardware()
+        for wheel in wheels
     }
     phases: list[Phase] = []
     counters = {wheel: wheel_test.make_counter(one) for wheel, one in hardware.items()}

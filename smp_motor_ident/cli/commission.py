@@ -3,7 +3,7 @@
 
 from functools import partial
 
-from smp_motor_ident.cli.frame import OF_ROS, Parser, number, run
+from smp_motor_ident.cli.frame import ROS_HELP, Parser, number, run
 
 NAME = "commission"
 
@@ -17,7 +17,7 @@ activated again at the end.
 
 def parser() -> Parser:
     """Return the parser of the command line."""
-    made = Parser(prog=NAME, description=DESCRIPTION, epilog=OF_ROS)
+    made = Parser(prog=NAME, description=DESCRIPTION, epilog=ROS_HELP)
     add = made.add_argument
     add(
         "--output", "-o", metavar="DIR", required=True, help="new folder for recordings and results"

@@ -32,8 +32,8 @@ from smp_motor_ident.result import Estimate
 AMPLITUDE, DURATION = 6.0, 15.0
 """Largest voltage [V] and length of a signal [s], unless the user or an earlier run says so."""
 
-UNFINISHED = "recording"  # folder of a recording until it is whole
-DISCOVERY_S = 2.0  # a controller that runs is discovered by then [s]
+UNFINISHED = "recording"  # folder of a recording until it is complete
+DISCOVERY_S = 2.0  # time in which a running controller is discovered [s]
 REPORT_TIMEOUT_S = 15.0  # of the first states of all wheels
 MAX_SEARCHES, EQUAL_SEARCHES = 15, 4
 """Largest number of searches for wheels [1 s each], and equal results in a row that end them."""
@@ -63,9 +63,9 @@ def work(arguments: argparse.Namespace) -> int:
     """Run the command and return its exit code."""
     folder = _prepare_folder(arguments)
     known = load_motors(arguments.motors) if arguments.motors else {}
-    begun = CommissioningLog(folder, arguments.accept)
-    # What the arguments leave open is as in the run that is resumed, else the defaults.
-    earlier = begun.document.get("asked", {})
+    log = CommissioningLog(folder, arguments.accept)
+    # Missing arguments are those of the run that is resumed, or the defaults.
+    earlier = log.document.get("asked", {})
     arguments.wheel = arguments.wheel or earlier.get("wheels")
     arguments.amplitude = arguments.amplitude or earlier.get("amplitude", AMPLITUDE)
     arguments.duration = arguments.duration or earlier.get("duration", DURATION)
@@ -77,13 +77,13 @@ def work(arguments: argparse.Namespace) -> int:
         return _commission(arguments, folder, known)
     finally:
         if folder.is_dir() and not (folder / commissioning_log.NAME).exists():
-            shutil.rmtree(folder)  # it has only logs, the wheels never moved
+            shutil.rmtree(folder)  # it holds only logs; the wheels never moved
 
 
 def _commission(arguments: argparse.Namespace, folder: Path, known: Mapping[str, Any]) -> int:
     ros = tuple(arguments.ros_arguments)
     bounds = {"max_speed": arguments.max_speed or 0.0, "max_current": arguments.max_current}
-    # The client leaves last: who excites has ended when the controllers are given back.
+    # The client exits last, so that excite has ended when the controllers are restored.
     with connect(commission.NAME, ros) as client, Processes(folder / "logs") as processes:
         _say("looking for the wheels that report, which takes some 5 s")
         wheels = tuple(dict.fromkeys(arguments.wheel or ())) or find_wheels(client)
@@ -93,11 +93,11 @@ def _commission(arguments: argparse.Namespace, folder: Path, known: Mapping[str,
         session = _begin(arguments, robot)
         if session is None:
             return 0
-        with client.paused(robot.wheels), session.log.ending():
+        with client.paused(robot.wheels), session.log.store_error():
             _move(session, known)
             designed = _design(session)
             verdict = _verify(session, designed)
-    session.log.end(True, verdict)
+    session.log.store_verdict(True, verdict)
     print("\n".join(session.log.summary()))
     print(f"{verdict}\nreport: {folder / 'report.html'}")
     if not arguments.apply:
@@ -108,34 +108,34 @@ def _commission(arguments: argparse.Namespace, folder: Path, known: Mapping[str,
 
 def _begin(arguments: argparse.Namespace, robot: steps.Robot) -> Session | None:
     """Ask before anything moves; discard results at other voltages or of other wheels."""
-    made = CommissioningLog(robot.folder, arguments.accept)
+    log = CommissioningLog(robot.folder, arguments.accept)
     asked = {name: getattr(arguments, name) for name in ("amplitude", "duration")}
     asked["wheels"] = list(robot.wheels)
-    same = made.document.get("asked") == asked
-    if same and made.ended and not arguments.apply:
-        _say(f"nothing is left to do: it passed. {made.ended}")
+    same = log.document.get("asked") == asked
+    if same and log.passed_verdict and not arguments.apply:
+        _say(f"nothing is left to do: it passed. {log.passed_verdict}")
         return None
     if not same:
-        if "asked" in made.document:
+        if "asked" in log.document:
             _say("wheels, amplitude or duration have changed: all steps are repeated")
-        made.begin(robot.wheels, asked)
-    left = [one for one in _recordings(arguments, made) if not (same and _is_recorded(robot, one))]
+        log.begin(robot.wheels, asked)
+    left = [one for one in _recordings(arguments, log) if not (same and _is_recorded(robot, one))]
     if left:
-        made.mark(identified=False, judged=False, tuned=False)
-    parts = {part: made.has(part) for part in ("checked", "identified", "tuned")}
+        log.mark(identified=False, judged=False, tuned=False)
+    parts = {part: log.has(part) for part in ("checked", "identified", "tuned")}
     schedule = plan.schedule(robot.wheels, left, **parts)
-    session = Session(arguments, robot, made, schedule)
+    session = Session(arguments, robot, log, schedule)
     _report_missing_controllers(arguments, robot)
     _confirm(arguments, robot.wheels, left, schedule)
     if not same:
         for name in (plan.FITTED, plan.HELD_OUT):
             shutil.rmtree(robot.folder / name, ignore_errors=True)
-        made.write()
+        log.write()
     return session
 
 
 def _report_missing_controllers(arguments: argparse.Namespace, robot: steps.Robot) -> None:
-    """Report wheels without a controller, for which one is started for the drive."""
+    """Report wheels without a controller; each gets one for the drive."""
     robot.client.until(lambda: not robot.uncontrolled(), DISCOVERY_S)
     missing = ", ".join(robot.uncontrolled())
     if missing and arguments.apply:
@@ -147,9 +147,9 @@ def _report_missing_controllers(arguments: argparse.Namespace, robot: steps.Robo
         _say(f"no wheel_pid runs for {missing}: one is started for the drive and ended after it")
 
 
-def _recordings(arguments: argparse.Namespace, made: CommissioningLog) -> list[plan.Recording]:
-    """Return the recordings at the voltage that the checks found, or before them at the largest."""
-    amplitude = made.document["amplitude"] if made.has("checked") else arguments.amplitude
+def _recordings(arguments: argparse.Namespace, log: CommissioningLog) -> list[plan.Recording]:
+    """Return the recordings, at the voltage found by the checks or, before them, at the limit."""
+    amplitude = log.document["amplitude"] if log.has("checked") else arguments.amplitude
     return plan.recordings(amplitude, arguments.duration)
 
 
@@ -159,26 +159,26 @@ def _is_recorded(robot: steps.Robot, one: plan.Recording) -> bool:
 
 def _move(session: Session, known: Mapping[str, Any]) -> None:
     """Check the wheels, then record them under excitation; skip completed steps."""
-    arguments, made = session.arguments, session.log
-    if not made.has("checked"):
+    arguments, log = session.arguments, session.log
+    if not log.has("checked"):
         _check(session, known)
-    for one in _recordings(arguments, made):
+    for one in _recordings(arguments, log):
         if not _is_recorded(session.robot, one):
             _record(session, one)
 
 
 def _check(session: Session, known: Mapping[str, Any]) -> None:
     """Check the wheels one by one; stop at faults that the user must repair."""
-    arguments, robot, made = session.arguments, session.robot, session.log
+    arguments, robot, log = session.arguments, session.robot, session.log
     bounds = Bounds(speed=arguments.max_speed or 0.0, current=arguments.max_current)
     checked = checking.check_wheels(
         robot.client, robot.wheels, arguments.amplitude, bounds, known,
         lambda wheel: session.begin(f"checking {wheel}"),
     )  # fmt: skip
-    made.checks(checked.figures, checked.amplitude, checked.speed)
-    made.stop(made.add("checks", checked.findings))
-    made.mark(checked=True)
-    made.write()
+    log.store_checks(checked.figures, checked.amplitude, checked.speed)
+    log.stop_on(log.add("checks", checked.findings))
+    log.mark(checked=True)
+    log.write()
 
 
 def _record(session: Session, one: plan.Recording) -> None:
@@ -197,19 +197,19 @@ def _record(session: Session, one: plan.Recording) -> None:
         steps.excite(robot, [one.excitation])
     finally:
         robot.processes.stop("excite", "record")
-    made = session.log
-    made.mark(identified=False, judged=False, tuned=False)
-    made.write()
+    log = session.log
+    log.mark(identified=False, judged=False, tuned=False)
+    log.write()
     (robot.folder / one.folder).mkdir(exist_ok=True)
     draft.rename(robot.folder / one.folder / one.name)
-    earlier = [r for r in _recordings(arguments, made) if r != one and _is_recorded(robot, r)]
-    made.stop(made.add(one.part, find_hot_windings(robot.folder, earlier, one)))
+    earlier = [r for r in _recordings(arguments, log) if r != one and _is_recorded(robot, r)]
+    log.stop_on(log.add(one.part, find_hot_windings(robot.folder, earlier, one)))
 
 
 def find_hot_windings(
     folder: Path, earlier: Sequence[plan.Recording], last: plan.Recording
 ) -> list[Finding]:
-    """Return which windings must cool before the next signal."""
+    """Return a finding for each winding that must cool before the next signal."""
     before, now = (
         read_experiments([str(folder / r.folder / r.name) for r in some]) if some else {}
         for some in (earlier, [last])
@@ -224,7 +224,7 @@ def find_hot_windings(
 
 def _design(session: Session) -> driving.DesignSet:
     """Identify and tune, skipping completed steps; write each result in one piece."""
-    arguments, robot, made = session.arguments, session.robot, session.log
+    arguments, robot, log = session.arguments, session.robot, session.log
     folder, gains = robot.folder, robot.folder / "gains.yaml"
     known = (folder / plan.FITTED / plan.EXTRA).is_dir()
     estimates = _identify(session, plan.IDENTIFYING)
@@ -234,28 +234,28 @@ def _design(session: Session) -> driving.DesignSet:
         session.schedule.add(plan.IDENTIFYING_AGAIN, "identify", plan.COMPUTE_S * len(robot.wheels))
         _record(session, more)
         estimates = _identify(session, plan.IDENTIFYING_AGAIN)
-    if not made.has("judged"):
-        made.add("identification", report_unreliable_motors(estimates))
-        made.add(
+    if not log.has("judged"):
+        log.add("identification", report_unreliable_motors(estimates))
+        log.add(
             "validation", validate_motors(estimates, folder / plan.FITTED, folder / plan.HELD_OUT)
         )
-        made.mark(judged=True)
-        made.write()
-    made.stop(made.refused("identification") or made.refused("validation"))
-    if not made.has("tuned"):
+        log.mark(judged=True)
+        log.write()
+    log.stop_on(log.find_blocking("identification") or log.find_blocking("validation"))
+    if not log.has("tuned"):
         session.begin(plan.TUNING)
         accepted = ["--accept-unreliable"] if UNRELIABLE in arguments.accept else []
         steps.tune_wheels(folder / "identification", gains, "--force", *accepted)
-        made.mark(tuned=True)
-        made.write()
+        log.mark(tuned=True)
+        log.write()
     return driving.read_designs(estimates, gains)
 
 
 def _identify(session: Session, part: str) -> dict[str, Estimate]:
     """Identify from all recordings, unless that is done."""
-    robot, made = session.robot, session.log
+    robot, log = session.robot, session.log
     results = robot.folder / "identification"
-    if made.has("identified"):
+    if log.has("identified"):
         return read_identification(results)
     session.begin(part)
     options = ["--force", "--quiet", "--accept-unreliable", "--validate"]
@@ -265,18 +265,18 @@ def _identify(session: Session, part: str) -> dict[str, Estimate]:
         estimates = steps.identify_wheels(robot.folder / plan.FITTED, results, *options)
     except ProcessError:
         if (results / "identification.json").is_file():
-            made.stop(
-                made.add("identification", report_unreliable_motors(read_identification(results)))
+            log.stop_on(
+                log.add("identification", report_unreliable_motors(read_identification(results)))
             )
         raise
-    made.mark(identified=True, judged=False, tuned=False)
-    made.write()
+    log.mark(identified=True, judged=False, tuned=False)
+    log.write()
     return estimates
 
 
 def _verify(session: Session, designed: driving.DesignSet) -> str:
     """Drive with the gains on trial, check the drive, and return the outcome."""
-    robot, made = session.robot, session.log
+    robot, log = session.robot, session.log
     robot.client.wait_for_wheels(robot.wheels, REPORT_TIMEOUT_S)
     session.schedule.add(
         plan.DRIVING, "drive", plan.START_S + sum(one[2] for one in driving.plan_drive(designed))
@@ -287,15 +287,15 @@ def _verify(session: Session, designed: driving.DesignSet) -> str:
         robot.start_controllers(own)
         with driving.on_trial(robot.client, designed.gains) as trial:
             changes, findings = driving.drive_undisturbed(robot, designed, _say)
-            made.changes(changes)
-            refused = made.add("verification", findings)
+            log.store_changes(changes)
+            refused = log.add("verification", findings)
             trial.kept = session.arguments.apply and not refused
     finally:
         robot.processes.stop(*(f"{wheel}.wheel_pid" for wheel in own))
     if refused:
-        print("the gains were taken back")
-        refused += made.warned_of({f.evidence.get("wheel") for f in refused})
-    made.stop(refused)
+        print("the previous gains were restored")
+        refused += log.find_warnings({f.evidence.get("wheel") for f in refused})
+    log.stop_on(refused)
     did = "The wheels drove as designed"
     if accepted := [f for f in findings if f.severity == "refused"]:
         did = f"The wheels drove, and {len(accepted)} findings of the drive were accepted"
@@ -344,7 +344,7 @@ def _prepare_folder(arguments: argparse.Namespace) -> Path:
     """Return the folder, or refuse before anything starts."""
     folder = Path(arguments.output)
     there = {path.name for path in folder.iterdir()} if folder.is_dir() else {folder.name}
-    if folder.exists() and there <= {"logs"}:  # of one that was killed before it began
+    if folder.exists() and there <= {"logs"}:  # a run was killed before it moved the wheels
         return folder
     if folder.exists() and not arguments.resume:
         raise ParameterError(

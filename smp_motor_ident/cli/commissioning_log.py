@@ -19,7 +19,7 @@ from smp_motor_ident.tune.verification import Change
 SCHEMA = 1
 NAME, REPORT = "commissioning.json", "report.html"
 PARTS = ("checked", "identified", "tuning_page", "judged", "tuned")
-"""Parts that are noted when they are done."""
+"""Parts of a commissioning that ``--resume`` skips once they are done."""
 
 SUMMARY = ("DC gain", "Time constant", "Static voltage", "p", "i", "d", "Settles, driven")
 """Rows of the page that the terminal shows."""
@@ -35,8 +35,12 @@ class CommissioningLog:
         if (folder / NAME).is_file():
             self.document = json.loads((folder / NAME).read_text("utf-8"))
         drove = self.document.get("passed") and self.document.get("changes")
-        self.ended = str(self.document["verdict"]) if drove else ""
-        self.document |= {"passed": None, "verdict": "It was cut off.", "accepted": [*accepted]}
+        self.passed_verdict = str(self.document["verdict"]) if drove else ""
+        self.document |= {
+            "passed": None,
+            "verdict": "The run was interrupted.",
+            "accepted": [*accepted],
+        }
 
     def begin(self, wheels: Sequence[str], asked: Mapping[str, Any]) -> None:
         """Clear earlier results before the wheels move again."""
@@ -44,21 +48,21 @@ class CommissioningLog:
             "wheels": list(wheels), "asked": asked, "findings": [], "changes": [],
             **dict.fromkeys(PARTS, False),
         }  # fmt: skip
-        self.ended = ""
+        self.passed_verdict = ""
 
     def has(self, part: str) -> bool:
-        """Tell whether one of :data:`PARTS` is done."""
+        """Return whether one of :data:`PARTS` is done."""
         return bool(self.document.get(part))
 
     def mark(self, **done: bool) -> None:
-        """Note which parts are done, so that ``--resume`` need not do them again."""
+        """Store which parts are done, so that ``--resume`` skips them."""
         self.document |= done
 
-    def checks(self, figures: Mapping[str, Figures], amplitude: float, speed: float) -> None:
+    def store_checks(self, figures: Mapping[str, Figures], amplitude: float, speed: float) -> None:
         """Record the results of the wheel checks, see :class:`~.checking.CheckResult`."""
         self.document |= plain({"checks": figures, "amplitude": amplitude, "speed": speed})
 
-    def changes(self, changes: Sequence[Change]) -> None:
+    def store_changes(self, changes: Sequence[Change]) -> None:
         """Record the responses of a drive."""
         self._changes = list(changes)
         self.document["changes"] = [
@@ -69,15 +73,15 @@ class CommissioningLog:
         ]
 
     def add(self, step: str, findings: Iterable[Finding]) -> list[Finding]:
-        """Note and print findings; return those that a commissioning stops at."""
+        """Store and print findings; return those that stop a commissioning."""
         new = list(findings)
         kept = [f for f in self.document.get("findings", []) if f["step"] != step]
         self.document["findings"] = kept + [{"step": step, **plain(f)} for f in new]
         for finding in new:
             print(f"{finding.severity}: {finding.message}", flush=True)
-        return self.refused(step)
+        return self.find_blocking(step)
 
-    def refused(self, step: str) -> list[Finding]:
+    def find_blocking(self, step: str) -> list[Finding]:
         """Return the findings of a step that stop a commissioning."""
         return self._noted(
             lambda f: (
@@ -85,7 +89,7 @@ class CommissioningLog:
             )
         )
 
-    def warned_of(self, wheels: Container[object]) -> list[Finding]:
+    def find_warnings(self, wheels: Container[object]) -> list[Finding]:
         """Return earlier warnings on these wheels, as possible reasons."""
         return self._noted(
             lambda f: f["severity"] == "warning" and f["evidence"].get("wheel") in wheels
@@ -98,25 +102,25 @@ class CommissioningLog:
             if wanted(f)
         ]
 
-    def stop(self, findings: Sequence[Finding]) -> None:
+    def stop_on(self, findings: Sequence[Finding]) -> None:
         """Write the verdict and raise, if a finding stops the commissioning."""
         if findings:
             what = "; ".join(dict.fromkeys(f.message for f in findings))
             advice = "; ".join(dict.fromkeys(f.advice for f in findings if f.advice))
-            self.end(False, f"stopped: {what}")
+            self.store_verdict(False, f"stopped: {what}")
             raise ProcessError(f"stopped: {what}. What to do: {advice}")
 
     @contextlib.contextmanager
-    def ending(self) -> Iterator[None]:
+    def store_error(self) -> Iterator[None]:
         """Record an error or interruption that ends the block."""
         try:
             yield
         except SmpError as error:
             if self.document["passed"] is None:
-                self.end(False, f"stopped: {error}")
+                self.store_verdict(False, f"stopped: {error}")
             raise
 
-    def end(self, passed: bool, verdict: str) -> None:
+    def store_verdict(self, passed: bool, verdict: str) -> None:
         """Write the verdict."""
         self.document |= {"passed": passed, "verdict": verdict}
         self.write()

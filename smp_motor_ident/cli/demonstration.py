@@ -35,7 +35,7 @@ DRIVE = (
 
 MAX_STALL_S = 0.008
 """Pause of the computer [s] after which a drive is repeated; the least disturbed drive is shown,
-and judged only if the machine kept pace."""
+and judged only if its pauses are shorter."""
 
 MAX_ATTEMPTS = 3
 
@@ -71,7 +71,7 @@ def work(arguments: argparse.Namespace) -> int:
     if stall <= MAX_STALL_S:
         checks += verdict.check_drive(changes)
     else:
-        print(f"---- the drive is not judged: this machine stood still for {1e3 * stall:.0f} ms")
+        print(f"---- the drive is not judged: the computer paused for {1e3 * stall:.0f} ms")
     for one in checks:
         mark = "ok  " if one.holds else "FAIL"
         print(f"{mark} {one.name}: {one.worst:.3g} {one.unit} at most {one.limit:g} ({one.where})")
@@ -90,7 +90,7 @@ def _clear_folder(folder: Path) -> Path:
 
 
 def start(robot: steps.Robot, motors: Path, rate: float) -> None:
-    """Start the simulated robot and wait until it lives; its controllers stay inactive."""
+    """Start the simulated robot and wait until it reports; its controllers stay inactive."""
     processes, client = robot.processes, robot.client
     given = ["--ros-args", "-p", f"motors_file:={motors.resolve()}", "-p", f"rate:={rate}"]
     processes.start("motor_plant", "motor_plant", *given, priority=1)
@@ -138,7 +138,7 @@ def drive(
         drives.append((stall, name, read, segments))
         if stall <= MAX_STALL_S:
             break
-        say(f"this machine stood still for {1e3 * stall:.0f} ms during drive {attempt}")
+        say(f"the computer paused for {1e3 * stall:.0f} ms during drive {attempt}")
     robot.switch("deactivate")
     stall, name, read, segments = min(drives, key=lambda one: one[0])
     say(f"showing {name}")

@@ -26,12 +26,12 @@ from smp_motor_ident.result import Estimate
 from smp_motor_ident.tune import verification
 from smp_motor_ident.tune.verification import STEADY_TIME_S, Change
 
-MIN_CHANGE = 0.8  # a smaller change of the set-point [rad/s, wheel] is no step to judge
+MIN_CHANGE = 0.8  # smallest change of set-point that is judged [rad/s, wheel]
 LEAD_S = 0.3  # rest before a drive that is simulated with it [s]
-MAX_SAMPLES = 1e6  # of a drive, which takes seconds
+MAX_SAMPLES = 1e6  # largest number of samples of a drive; its simulation takes seconds
 STATE_COLUMNS = ("encoder_count", "position", "voltage")
 ANSWER_COLUMNS = ("setpoint", "age", "dt", "output")
-MIN_STEP_S = 1.0  # of a change of set-point with its end [s]
+MIN_STEP_S = 1.0  # shortest duration of a set-point in a drive [s]
 MAX_ATTEMPTS = 3  # largest number of drives; a disturbed drive is repeated
 
 
@@ -108,7 +108,7 @@ def evaluate_changes(
         (state.seconds, state.columns["voltage"]),
         entry["loop"],
     )
-    # The first interval is that since another drive.
+    # The first interval began before this drive.
     late = answers.columns["dt"][1:], delays[1:]
     silence = max(float(np.max(one, initial=0.0)) for one in late)
     if not moves:
@@ -189,19 +189,19 @@ def compute_wheel_angle(state: Table, hardware: Hardware) -> Array:
 
 
 def compute_wheel_speed(state: Table, hardware: Hardware) -> tuple[Array, Array]:
-    """Return the wheel's speed as its encoder saw it."""
+    """Return times and speed of a wheel from its encoder."""
     angle = compute_wheel_angle(state, hardware)
     step = float(np.median(np.diff(state.seconds)))
     return verification.smooth_speed(state.seconds, angle - angle[0], step)
 
 
 class NoMessageError(ProcessError):
-    """A wheel's controller published nothing at a set-point of the drive."""
+    """A controller published no message at a set-point of the drive."""
 
 
 @dataclass
 class Trial:
-    """Gains on trial; ``kept`` tells whether they stay after it."""
+    """Gains on trial; ``kept``: whether they stay afterwards."""
 
     kept: bool = False
 

@@ -76,7 +76,7 @@ def work(
 
 
 def _hash_inputs(path: Path, options: str) -> str:
-    """Return the key of a result: a hash of all that it depends on."""
+    """Return a hash of everything that a result depends on."""
     if not path.exists():
         raise BagError(f"{path}: no such file or folder")
     parts = sorted(path.rglob("*")) if path.is_dir() else [path]
@@ -106,7 +106,7 @@ def identify_one(path: str, settings: tuple[Any, ...]) -> list[fleet.Row]:
             rows.append(_make_row(path, **about, values=values, **verdict))
     except SmpError as error:
         return [_make_row(path, failure=str(error))]
-    except Exception as error:  # whatever is wrong with one recording, the others go on
+    except Exception as error:  # one bad recording must not end the others
         return [_make_row(path, failure=f"{path}: {type(error).__name__}: {error}")]
     return rows
 
@@ -137,7 +137,7 @@ def _identify_all(
                     del tries[futures[future]]
                     yield futures[future], result
             except BrokenProcessPool:
-                # Which one it was is not known: those under way are tried again, one at a time.
+                # The recording is unknown: those in progress are tried again, one at a time.
                 for path in list(tries)[: 1 if cores == 1 else cores]:
                     tries[path] += 1
         for path in [p for p, n in tries.items() if n >= MAX_ATTEMPTS]:

@@ -20,14 +20,12 @@ from smp_motor_control.ros_arguments import split_arguments
 from smp_motor_ident.cli.interruption import check, interruptible
 
 INTERRUPTED = 130  # exit code after Ctrl-C, as shells have it
-TIMEOUT_S = 2.0  # without a terminal a step is named when it has taken so long [s]
+# Without a terminal a step is printed when it has lasted TIMEOUT_S, or after SILENCE_S.
+TIMEOUT_S = 2.0
+SILENCE_S = 4.0
 
-SILENCE_S = 4.0  # and any step is named after so long without a line [s]
-
-
-OF_ROS = "A robot in a namespace: end the line with --ros-args -r __ns:=/robot1."
-"""In the help of the tools that look for a running robot."""
-
+ROS_HELP = "A robot in a namespace: end the line with --ros-args -r __ns:=/robot1."
+"""Help on namespaces, for tools that connect to a running robot."""
 
 Work = Callable[[argparse.Namespace], int | None]
 """From the parsed arguments to an exit code; None is 0."""
@@ -42,7 +40,7 @@ class Parser(argparse.ArgumentParser):
 
 
 class _Output:
-    """Standard output that lets a tool finish its work when the reader (head, less) has gone."""
+    """Standard output that ignores a closed pipe (head, less), so that a tool finishes its work."""
 
     def __init__(self, stream: Any) -> None:
         self._stream = stream
@@ -79,12 +77,12 @@ def run(made: Callable[[], Parser], work: Work | str, argv: Sequence[str] | None
         arguments = parser.parse_args(own)
         arguments.command, arguments.ros_arguments = shlex.join((parser.prog, *given)), ros
         with interruptible(), warnings.catch_warnings():
-            # Numerics that fail are dealt with where they occur; standard error is for the user.
+            # Numerical failures are handled where they occur; standard error is for the user.
             warnings.simplefilter("ignore", RuntimeWarning)
             code = _run_work(work, arguments)
         sys.stdout.flush()
         return code
-    except SystemExit as end:  # of the parser, which has said why
+    except SystemExit as end:  # the parser has printed the reason
         sys.stdout.flush()
         return int(end.code or 0)
     except SmpError as error:
@@ -94,7 +92,7 @@ def run(made: Callable[[], Parser], work: Work | str, argv: Sequence[str] | None
     except OSError as error:
         return _fail(parser.prog, f"{error.filename or 'output'}: {error.strerror or error}", 2)
     except ModuleNotFoundError:
-        raise  # the entry point says how to install it
+        raise  # the entry point prints how to install it
     except Exception as error:
         if os.environ.get("SMP_DEBUG"):
             raise
@@ -105,7 +103,7 @@ def run(made: Callable[[], Parser], work: Work | str, argv: Sequence[str] | None
 
 
 def _run_work(work: Work | str, arguments: argparse.Namespace) -> int:
-    """Do the work; an error behind a Ctrl-C that some callback has dropped is that Ctrl-C."""
+    """Do the work; after a Ctrl-C that a callback has dropped, an error counts as that Ctrl-C."""
     try:
         return _load_work(work)(arguments) or 0
     except SmpError:
@@ -118,8 +116,8 @@ def _run_work(work: Work | str, arguments: argparse.Namespace) -> int:
 def _load_work(work: Work | str) -> Work:
     if not isinstance(work, str):
         return work
-    # Wheels are worked on side by side: the threads of a linear algebra of a few columns would
-    # only wait for each other.  While modules load, nothing becomes garbage.
+    # Wheels are estimated in parallel processes, so linear algebra gets one thread.  Loading
+    # modules produces no garbage to collect.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     gc.disable()
     try:
@@ -135,7 +133,7 @@ def _fail(program: str, message: str, code: int) -> int:
 
 
 def number(low: float, high: float = float("inf")) -> Callable[[str], float]:
-    """Return an argument type that takes a finite number between two others, without them."""
+    """Return an argument type for numbers strictly between two limits."""
 
     def read(text: str) -> float:
         try:

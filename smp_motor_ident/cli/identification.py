@@ -172,7 +172,7 @@ def identify_wheel(
     except SmpError as error:
         return Outcome(failure=error)
     except np.linalg.LinAlgError as error:
-        # One wheel's numerics must not take the others' results with them.
+        # A numerical failure of one wheel must not discard the results of the others.
         text = (
             f"{records[0].source}: {records[0].wheel}: the estimation failed ({error}); "
             "record a longer excitation with several frequencies, in both directions"
@@ -311,8 +311,8 @@ def setpoint_map(arguments: argparse.Namespace) -> SignalMap:
             raise ParameterError(f"--controller: {wheel}: map the velocity that the loop measured")
         if signals["voltage"].topic != signals["velocity"].topic:
             raise ParameterError(
-                f"--controller: {wheel}: set-point and velocity must be of one message or row; for "
-                "which step of the loop another topic's set-point came in is not known"
+                f"--controller: {wheel}: set-point and velocity must come from one message or row; "
+                "with two topics their steps of the loop cannot be matched"
             )
         signals["voltage"] = replace(signals["voltage"], unit="V")
         motors[wheel] = replace(plan, signals=signals, held="after")

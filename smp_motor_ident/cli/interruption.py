@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Handle Ctrl-C reliably: store it when it comes, raise it again where a tool waits.
+"""Handle Ctrl-C reliably: store it when it comes, and raise it again where a tool waits.
 
-Python drops an exception that a signal handler raises inside some callbacks, among them those
-around a fork; a tool that is just starting a process would then go on as if nobody had asked.
+Python drops an exception that a signal handler raises inside some callbacks, such as those around a
+fork; a tool that is just starting a process would then ignore it.
 """
 
 import os

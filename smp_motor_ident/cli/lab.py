@@ -3,7 +3,7 @@
 
 from functools import partial
 
-from smp_motor_ident.cli.frame import OF_ROS, Parser, number, run
+from smp_motor_ident.cli.frame import ROS_HELP, Parser, number, run
 
 NAME = "lab"
 
@@ -16,7 +16,7 @@ moves before it is armed on the page; one page drives, others watch.
 
 def parser() -> Parser:
     """Return the parser of the command line."""
-    made = Parser(prog=NAME, description=DESCRIPTION, epilog=OF_ROS)
+    made = Parser(prog=NAME, description=DESCRIPTION, epilog=ROS_HELP)
     add = made.add_argument
     add("--demo", action="store_true", help="start a simulated robot to work with")
     add("--output", "-o", default="lab_output", metavar="DIR",

@@ -21,7 +21,7 @@ NICENESS = 5  # of the process that designs
 
 
 def begin() -> None:
-    """Begin the process that designs: it ends with its parent, and the robot goes first."""
+    """Initialise the design process: it ends with its parent and has a low priority."""
     end_with_parent()
     os.nice(NICENESS)
 
@@ -63,14 +63,14 @@ def choose(wheel: str, share: float, phase_margin: float) -> dict[str, Any]:
 
 
 def judge(wheel: str, p: float, i: float, d: float) -> dict[str, Any]:
-    """Return what gains [V per wheel rad/s] that were set by hand do."""
+    """Evaluate gains that were typed by hand [V s/rad and so on, wheel]."""
     estimate, own = _estimates[wheel], _own[wheel]
     feedback = Feedback(p, i, d, own.feedback.filter_time).scaled(1 / own.loop.gear_ratio)
     return _describe(wheel, tuning_page.judge(estimate, own, feedback))
 
 
 def _describe(wheel: str, choice: Choice) -> dict[str, Any]:
-    """Return a design as the page and the robot take it."""
+    """Return a design for the page and the robot."""
     found = choice.design
     made = {**tuning_page.describe(choice), "wheel": wheel}
     if found is None or choice.curves is None:

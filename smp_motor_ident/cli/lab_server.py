@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Serve the page of ``lab``: one page drives and is heard every 0.1 s, or the wheels stop."""
+"""Serve the page of ``lab``: one page drives, and the wheels stop when it becomes silent."""
 
 import asyncio
 import concurrent.futures
@@ -34,7 +34,7 @@ POLICY = (
     "worker-src blob:; frame-src 'self'; base-uri 'none'; form-action 'none'; "
     "frame-ancestors 'none'"
 )
-REPORT_POLICY = "sandbox allow-scripts; frame-ancestors 'self'"  # its scripts reach nothing here
+REPORT_POLICY = "sandbox allow-scripts; frame-ancestors 'self'"  # no access to this server
 
 
 class Page:
@@ -63,7 +63,9 @@ class Server:
         self._pages: list[Page] = []
         self._driver: Page | None = None
         self._session, self._token = secrets.token_urlsafe(32), ""
-        self._base = f"/{secrets.token_urlsafe(9)}"  # other servers of this host get no cookie
+        self._base = (
+            f"/{secrets.token_urlsafe(9)}"  # keeps the cookie from other servers of this host
+        )
         self._last: dict[str, str] = {}  # the newest message of each kind, for pages that join
         self._loop = asyncio.new_event_loop()
         self._ended = asyncio.Event()
@@ -117,13 +119,13 @@ class Server:
             await runner.cleanup()
 
     async def _watch(self) -> None:
-        """Stop the wheels when the page that drives is heard no more."""
+        """Stop the wheels when the page that drives becomes silent."""
         link, before, late = self._laboratory.link, time.monotonic(), False
         while not self._ended.is_set():
             await asyncio.sleep(WATCH_PERIOD_S)
             now, driver = time.monotonic(), self._driver
             late, before = not late and now - before > SILENCE_TIMEOUT_S / 2, now
-            # After a pause of this process the page may have been heard, and not been read yet.
+            # After a pause of this process, messages of the page may still be unread.
             if (
                 link.armed
                 and not late
@@ -142,7 +144,7 @@ class Server:
         print(f"lab: open {self._address()}", flush=True)
 
     def _is_own_host(self, host: str) -> bool:
-        """Return whether a host is this server's, and no name that an attacker bound to it."""
+        """Return whether a Host header names this server; rejects DNS rebinding."""
         name, _, port = host.rpartition(":")
         address = not _is_loopback(self._host) and re.fullmatch(r"[\d.]+|\[[\da-f:]+\]", name)
         known = name in {self._host, "localhost", "127.0.0.1", "[::1]"}
@@ -152,13 +154,17 @@ class Server:
     async def _authorise(
         self, request: web.Request, handler: Callable[[web.Request], Awaitable[web.StreamResponse]]
     ) -> web.StreamResponse:
-        """Let only own pages in: by address, cookie and, for the stream, origin."""
+        """Reject requests without the host, cookie and, for the stream, origin of this server."""
         if not self._is_own_host(request.host):
-            raise web.HTTPForbidden(text="lab: this address is not mine; open the one it printed\n")
+            raise web.HTTPForbidden(
+                text="lab: unknown host name; open the address that lab printed\n"
+            )
         token = request.query.get("token")
         if request.path == "/" and token is not None:
             if not secrets.compare_digest(token.encode(), self._token.encode()):
-                raise web.HTTPForbidden(text="lab: the token was used; open the last one printed\n")
+                raise web.HTTPForbidden(
+                    text="lab: invalid or used token; open the last address printed\n"
+                )
             self._print_address()
             answer = web.HTTPFound(f"{self._base}/", headers=HEADERS)
             cookie = "lab", self._session
@@ -166,12 +172,12 @@ class Server:
             raise answer
         known = request.cookies.get("lab", "")
         if not secrets.compare_digest(known.encode(), self._session.encode()):
-            raise web.HTTPForbidden(text="lab: open the address that it printed, with its token\n")
+            raise web.HTTPForbidden(text="lab: open the address that lab printed, with its token\n")
         if (
             request.path.endswith("/ws")
             and request.headers.get("Origin") != f"http://{request.host}"
         ):
-            raise web.HTTPForbidden(text="lab: another page may not connect\n")
+            raise web.HTTPForbidden(text="lab: rejected a connection from another origin\n")
         return await handler(request)
 
     async def _page(self, request: web.Request) -> web.Response:
@@ -207,7 +213,7 @@ class Server:
         tasks = {asyncio.ensure_future(page.write())}
         try:
             async for message in socket:
-                if message.type is WSMsgType.TEXT:  # a stop waits for no design
+                if message.type is WSMsgType.TEXT:  # a stop must not wait
                     tasks.add(task := asyncio.ensure_future(self._on_message(page, message.data)))
                     task.add_done_callback(tasks.discard)
         finally:
@@ -230,13 +236,13 @@ class Server:
         page.heard_at = time.monotonic()
         try:
             await self._perform(page, json.loads(text))
-        except Exception as error:  # whatever a page sends, the others go on
-            told = str(error) if isinstance(error, SmpError) else f"a wrong request: {error!r}"
+        except Exception as error:  # an invalid request must not disturb other pages
+            told = str(error) if isinstance(error, SmpError) else f"invalid request: {error!r}"
             page.queue.put_nowait(templates.encode(["refused", told]))
 
     async def _perform(self, page: Page, message: Any) -> None:
         wanted, driver, link = message["do"], self._driver, self._laboratory.link
-        if wanted == "stop":  # which every page may
+        if wanted == "stop":  # any page may
             link.halt("stop was pressed")
         elif wanted == "take":
             if driver is not None and time.monotonic() - driver.heard_at < TAKEOVER_AFTER_S:
@@ -252,7 +258,7 @@ class Server:
             self._laboratory.ask(message)
 
     async def _design(self, page: Page, message: dict[str, Any]) -> None:
-        """Answer a move of the sliders with the design there."""
+        """Send the design for the values of the sliders."""
         begun, wheel = time.monotonic(), str(message["wheel"])
         if wheel not in self._laboratory.state["wheels"] or not self._laboratory.state["designed"]:
             raise ParameterError(f"{wheel} has no design yet; design first")

@@ -36,7 +36,7 @@ from smp_motor_ident.report.document import read_identification
 from smp_motor_ident.result import UNITS, Quantity
 
 MOVING_JOBS = ("arming", "exciting", "trying gains", "stepping")  # jobs that need the wheels
-TRIAL_S = 2.5  # for which gains on trial are watched
+TRIAL_S = 2.5  # duration of a trial of gains
 STEP_BEGIN_S, STEP_LENGTH_S = 0.3, 1.2  # begin and length of the step of a trial
 STATE_PERIOD_S = 0.1  # shortest time between two messages about the state
 BACKGROUND_PRIORITY = -10  # priority of computations while the robot runs
@@ -62,7 +62,7 @@ def work(arguments: argparse.Namespace) -> int:
         Processes(folder / "logs") as processes,
         ProcessPoolExecutor(1, SPAWN, initializer=lab_designs.begin) as designs,
     ):
-        designs.submit(int)  # it loads its modules meanwhile
+        designs.submit(int)  # starts the process, which loads its modules meanwhile
         if arguments.demo:
             robot = steps.Robot(processes, client, WHEELS, folder, ros, bounds)
             motors = Path(arguments.motors) if arguments.motors else find_config(PAPER_MOTORS)
@@ -110,12 +110,12 @@ class Laboratory:
         self._reason = ""
         self.interrupt = partial(robot.processes.interrupt, "excite")  # ends an excitation at once
         self._stack = ExitStack()
-        self._holds_controllers = False  # whether the controllers are this laboratory's
+        self._holds_controllers = False  # whether their former state is to be restored
 
     def close(self) -> None:
-        """Stop the wheels, and give the controllers back."""
+        """Stop the wheels and restore the controllers."""
         self.link.halt("lab ends")
-        with self._stack:  # gives the controllers back in any case
+        with self._stack:  # restores the controllers in any case
             self.robot.client.spin(2 * STATE_PERIOD_S)
             self.robot.processes.stop("excite", "record", "identifier", "identify")
             if self._holds_controllers:
@@ -136,7 +136,7 @@ class Laboratory:
             self.state["job"] = name
             try:
                 work()
-            except Exception as error:  # the wheels are still to be watched and stopped
+            except Exception as error:  # keep running, to watch and stop the wheels
                 known = isinstance(error, SmpError)
                 self.tell(str(error) if known else f"the request failed: {error!r}", "error")
                 if name in MOVING_JOBS:
@@ -225,7 +225,7 @@ class Laboratory:
         if wanted not in jobs:
             raise ParameterError(f"the request {wanted!r} is not known")
         if wanted in ("excite", "apply", "step") and not self.link.armed:
-            raise ParameterError("press Arm first: nothing moves before it")
+            raise ParameterError("press Arm first; no wheel moves before")
         if self.state["job"]:
             raise ParameterError(f"busy with {self.state['job']}; wait, or stop it")
         self._jobs.put(jobs[wanted])
@@ -361,7 +361,7 @@ class Laboratory:
             if first and not outcome.missing:
                 del self._before[wheel]
                 self._store_pending_restore()
-            raise ProcessError(f"the gains before were restored: {outcome.reason}")
+            raise ProcessError(f"the previous gains were restored: {outcome.reason}")
         self._tried[wheel] = made
         self._show_step(wheel, made)
 
@@ -451,7 +451,7 @@ class Prediction:
 
 
 def _describe_motor(estimate: Any) -> dict[str, Any]:
-    """Return an identified motor in the words of the page."""
+    """Return an identified motor in the form that the page shows."""
     held = {**estimate.combinations, **estimate.parameters}
     grave = [one for one in estimate.findings if one.severity != "note"][:MAX_MESSAGES]
     unreliable = any(one.severity in ("unreliable", "refused") for one in grave)

@@ -36,7 +36,7 @@ CHECK_S, START_S, COMPUTE_S, DRIVE_S = 8.0, 4.0, 4.0, 12.0
 identification or tuning of one wheel, the drive."""
 
 DRAWN_S, COLUMNS, BLOCKS = 4.0, 72, "▁▂▃▄▅▆▇█"
-"""So many seconds of a signal are drawn, on so many columns, with these levels."""
+"""Drawn length of a signal [s], number of columns, and characters of the levels."""
 
 
 @dataclass(frozen=True)
@@ -70,8 +70,8 @@ def recordings(amplitude: float, duration: float) -> list[Recording]:
 def plan_extra_recording(estimates: Mapping[str, Estimate], amplitude: float) -> Recording | None:
     """Return the recording that would reduce the uncertainty of these estimates, or None.
 
-    Open is what gains are designed from: parameters and combinations that the data give, known to
-    less than the accuracy wanted.  Of several wheels the one that needs the longest decides.
+    It is needed while a quantity that gains depend on misses the required accuracy.  The wheel that
+    needs the longest recording decides.
     """
     proposals = [
         what_next(one, REQUIRED_ACCURACY, supply=amplitude, longest=MAX_EXTRA_S)
@@ -93,10 +93,9 @@ def _is_uncertain(estimate: Estimate) -> bool:
 
 
 class Schedule:
-    """Parts that are done one after the other, and the time that is left.
+    """Successive parts of a commissioning, and the remaining time.
 
-    Parts of a kind are late alike: the time left is the planned one and, for each part, the mean
-    excess of the parts of its kind that are done.
+    The time left of a part is the planned one plus the mean delay of finished parts of its kind.
     """
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
@@ -141,7 +140,7 @@ def schedule(
     identified: bool = False,
     tuned: bool = False,
 ) -> Schedule:
-    """Return the parts of a commissioning that are not done yet."""
+    """Return the remaining parts of a commissioning."""
     made = Schedule()
     for wheel in () if checked else wheels:
         made.add(f"checking {wheel}", "check", CHECK_S)
@@ -156,7 +155,7 @@ def schedule(
 
 
 def format_duration(seconds: float) -> str:
-    """Return a time to wait as a person says it."""
+    """Return a rounded duration in words."""
     whole = round(seconds / 5) * 5 if seconds > 20 else round(seconds)
     return f"{whole // 60} min {whole % 60} s" if whole >= 60 else f"{whole} s"
 

@@ -46,7 +46,7 @@ def connect(name: str, ros_arguments: Sequence[str] = ()) -> Iterator[Any]:
 
 
 def free_domain(first: int = 215, last: int = 232) -> int:
-    """Claim a ROS domain that nobody on this machine uses, for as long as this process lives.
+    """Claim a ROS domain that is unused on this machine, until this process ends.
 
     References
     ----------
@@ -108,7 +108,7 @@ class Processes:
                 signal.signal(number, handler)
 
     def start(self, name: str, node: str, *arguments: str, priority: int = 0) -> None:
-        """Start a node or a tool, with real-time priority, or, below 0, with less than usual."""
+        """Start a node or a tool with a real-time priority or, below 0, with a niceness."""
         self._logs.mkdir(parents=True, exist_ok=True)
         parent = os.getpid()
         with (self._logs / f"{name}.log").open("wb") as log, interruption.delayed():
@@ -158,7 +158,7 @@ class Processes:
         """Return the last line that a process has printed."""
         log = self._logs / f"{name}.log"
         lines = log.read_text(errors="replace").strip().splitlines() if log.exists() else []
-        return lines[-1] if lines else "it said nothing"
+        return lines[-1] if lines else "no output"
 
     def stop(self, *names: str) -> None:
         """Stop processes together, by stronger signals in turn."""
@@ -176,7 +176,7 @@ class Processes:
 
 
 def _command(node: str) -> list[str]:
-    """Return how a node is started: as its installed executable, else as that would."""
+    """Return the command of a node: its installed executable or, without one, its entry point."""
     for prefix in os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep):
         executable = Path(prefix) / "lib" / "smp_motor_control" / node
         if prefix and executable.is_file():

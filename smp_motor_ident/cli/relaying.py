@@ -90,7 +90,7 @@ def _even(
     """Return voltage and speed of one stretch as means over the intervals of an even grid."""
     lasted = np.diff(time)
     grid = np.arange(time[0], time[-1], step)
-    if not np.isfinite(applied).all():  # the hardware does not tell it
+    if not np.isfinite(applied).all():  # the hardware does not report it
         applied = np.concatenate([[0.0], voltage[:-1]])
     # Means over intervals, long and short, are exact as integrals at their ends.
     volt_seconds = np.concatenate([[0.0], np.cumsum(applied[1:] * lasted)])

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from smp_motor_control import get_controller_name
-from smp_motor_ident.bag import writer  # noqa: F401  (that a package is missing is said at once)
+from smp_motor_ident.bag import writer  # noqa: F401  (a missing package is reported at once)
 from smp_motor_ident.cli import identify, tables, tune  # noqa: F401
 from smp_motor_ident.cli.processes import ProcessError, Processes
 from smp_motor_ident.report.document import read_identification
@@ -55,7 +55,7 @@ class Robot:
         self.client.change_states([get_controller_name(wheel) for wheel in self.wheels], transition)
 
 
-TIMEOUT_S = 60.0  # how long a busy machine may take to start or end a process [s]
+TIMEOUT_S = 60.0  # longest time in which a process starts or ends on a busy machine [s]
 TOPICS = "/(.*/)?(motor_.*|pid_state|wheel_setpoints|cmd_vel|odom|joint_states|diagnostics)"
 """Topics of a robot that ``record`` keeps."""
 
@@ -73,7 +73,7 @@ def record(robot: Robot, name: str, *shown: str) -> Path:
 def excite(
     robot: Robot, plan: Sequence[Excitation], wait: Callable[[], None] = lambda: None
 ) -> None:
-    """Move all wheels by one signal after the other; ``wait`` may wait for the end in its way."""
+    """Excite all wheels by one signal after the other; ``wait`` is called during each."""
     for part in plan:
         parameters: dict[str, object] = {
             "signal": part.signal, "wheels": f"[{', '.join(robot.wheels)}]",

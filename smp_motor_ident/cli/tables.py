@@ -27,7 +27,7 @@ def console() -> Console:
 
 
 def table(title: str, *columns: str) -> Table:
-    """Return an empty table; its first column is of words."""
+    """Return an empty table whose first column is left-aligned."""
     made = Table(title=title or None, title_justify="left", title_style="bold")
     made.box, made.pad_edge = box.SIMPLE_HEAD, False
     for k, column in enumerate(columns):
@@ -97,7 +97,7 @@ def print_topics(paths: Sequence[str], msg_files: Sequence[str], program: str) -
         for finding in listing.findings:
             out.print(f"{finding.severity}: {finding.message}", soft_wrap=True)
         if not listing.needs_mapping:
-            out.print("no mapping is needed: the wheels are described by our own messages")
+            out.print("no mapping is needed: the wheels are described by smp_interfaces messages")
         elif listing.suggestion:
             given = " ".join(shlex.quote(item) for item in listing.suggestion)
             out.print(f"suggestion: --map {given}", soft_wrap=True)

@@ -66,7 +66,7 @@ def parser() -> frame.Parser:
         "Design the speed controllers of identified motors for the sampled loop that will run. "
         "Write a parameter file for wheel_pid, or gains for another controller."
     )
-    p = frame.Parser(prog="tune", description=about, epilog=frame.OF_ROS)
+    p = frame.Parser(prog="tune", description=about, epilog=frame.ROS_HELP)
     add = p.add_argument
     add("source", type=Path, nargs="?", help="identification.json, its folder, or motors.yaml")
     add("--output", type=Path, metavar="FILE",

@@ -32,12 +32,12 @@ class Robot:
 
     figures: Mapping[str, Figures]  # by wheel
     hardware: Mapping[str, Hardware]  # as the robot describes itself
-    # by driven wheel how far every wheel turned meanwhile [counts]
+    # counts that every wheel turned while one was driven, by driven wheel
     moved: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
-    # known motor speeds per volt, as from a motor file; empty where none is known [rad/s/V]
+    # motor speeds per volt, known from a motor file [rad/s/V]
     gains: Mapping[str, float] = field(default_factory=dict)
     ratios: Mapping[str, float] = field(default_factory=dict)  # known gear ratios
-    battery: float = math.nan  # voltage that the battery reports [V]; NaN where it does not
+    battery: float = math.nan  # voltage that the battery reports [V]; NaN if it does not
     # by wheel the fault of the position that its driver reports, and its remedy
     positions: Mapping[str, str] = field(default_factory=dict)
 

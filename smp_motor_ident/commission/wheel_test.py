@@ -88,12 +88,12 @@ class Figures:
 
 
 def responds_clearly(level: float, breakaway: float, counts: float) -> bool:
-    """Tell whether a wheel's response depends more on the motor than on friction."""
+    """Return whether a wheel's response depends more on the motor than on friction."""
     return level * MAX_FRICTION_SHARE >= breakaway and counts >= MIN_RESPONSE_COUNTS
 
 
 def has_settled(hold: Trace) -> bool:
-    """Tell whether a wheel turned as far in the last third of a held voltage as in the second.
+    """Return whether a wheel turned as far in the last third of a held voltage as in the second.
 
     Thirds of the time of the reported voltage, because a busy computer takes samples in bunches.
     """
@@ -155,7 +155,7 @@ def figures(trace: Trace, phases: Sequence[Phase], hardware: Hardware) -> Figure
 def count_coupled_motion(
     traces: Mapping[str, Trace], phases: Sequence[Phase]
 ) -> dict[str, dict[str, float]]:
-    """Return by driven wheel how far every wheel turned meanwhile [counts]."""
+    """Return the counts that every wheel turned while one was driven, by driven wheel."""
     found: dict[str, dict[str, float]] = {}
     for driven in dict.fromkeys(p.wheel for p in phases):
         numbers = [p.number for p in phases if p.wheel == driven and p.kind in ("ramp", "hold")]
@@ -210,7 +210,7 @@ def _coast(hold: Trace, coast: Trace, hardware: Hardware) -> float:
     if not steady.speed or free.time.size < 2:
         return math.nan
     if abs(float(np.median(free.voltage[-8:]))) > MAX_SUPPLY_SHORTFALL * abs(steady.voltage):
-        return math.nan  # a busy computer did not let go of it yet
+        return math.nan  # a busy computer has not yet released it
     angle = free.count * _angle_per_count(hardware)
     return float((angle[-1] - angle[0]) / steady.speed)
 

@@ -122,7 +122,7 @@ class Wheel:
         self.unstamped = not nanoseconds
         self.watch.hear(info)
         if self.watch.has_two_publishers or self.unstamped:
-            return  # of two wheels, or of no instant
+            return  # the samples mix two wheels, or have no time
         if self.monitor is not None:
             turned = self._turned(message.encoder_count, message.position)
             self.monitor.add(1e-9 * nanoseconds, message.voltage, message.current, turned)
@@ -175,7 +175,7 @@ class Identifier(Node):
         }
         self._worker = ThreadPoolExecutor(max_workers=1)
         self._not_before = 0.0
-        self._compiled = False  # the first estimate loads or compiles code, too: it counts for none
+        self._compiled = False  # the first estimate includes loading and compiling
         self._diagnostics = runtime.Diagnostics(self, self._assess)
         runtime.steady_timer(self, TAKE_PERIOD_S, self._take_all)
         runtime.steady_timer(self, settings.period, self._start_estimates)
@@ -188,7 +188,7 @@ class Identifier(Node):
             wheel.take()
 
     def _start_estimates(self) -> None:
-        """Hand every window with enough excitation to the worker; report the others' lack.
+        """Submit every window with enough excitation; report what the others lack.
 
         A pause in proportion to its cost follows every estimate; the last window before samples
         stop arriving skips the pause.
@@ -201,11 +201,11 @@ class Identifier(Node):
             try:
                 self._check_source(wheel)
                 record = wheel.window.record()
-                lacks = find_missing_excitation(record)
+                missing = find_missing_excitation(record)
             except (SmpError, ArithmeticError, ValueError) as error:
-                record, lacks = None, [str(error)]
-            if lacks or record is None:
-                wheel.publish("collecting: " + "; ".join(lacks))
+                record, missing = None, [str(error)]
+            if missing or record is None:
+                wheel.publish("collecting: " + "; ".join(missing))
             elif ceased or now >= self._not_before:
                 wheel.estimated = wheel.seen
                 wheel.running = self._worker.submit(partial(_identify, record, settings.model))
@@ -251,7 +251,7 @@ class Identifier(Node):
                 states,
             )
         watched = {n: w.monitor for n, w in self._wheels.items() if w.monitor is not None}
-        if watched:  # then a wheel that has nothing to say of itself is no warning
+        if watched:  # then a wheel without an estimate is no warning
             level, message = runtime.OK, f"{len(watched)} wheels watched; {message}"
         for name, monitor in watched.items():
             now = monitor.values()

@@ -65,7 +65,7 @@ class Topic:
     last_number: int = 0
     lost: int = 0
     watch: PublisherWatch = field(default_factory=PublisherWatch)
-    doubled: bool = False  # whether that was said
+    doubled: bool = False  # whether two publishers have been reported
 
 
 def subscription_qos(offered: list[QoSProfile]) -> QoSProfile:

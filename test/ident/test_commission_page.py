@@ -55,12 +55,12 @@ def passed(tmp_path: Path) -> Path:
     (tmp_path / "gains.yaml").write_text("# designed by tune\n" + yaml.safe_dump(nodes))
     made = CommissioningLog(tmp_path)
     made.begin(WHEELS, {})
-    made.checks(dict.fromkeys(WHEELS, FIGURES), 6.0, 1.6)
-    made.changes(
+    made.store_checks(dict.fromkeys(WHEELS, FIGURES), 6.0, 1.6)
+    made.store_changes(
         [change(w, n, v) for w in WHEELS for n, v in (("forward", 1.2), ("reverse", -1.2))]
     )
     made.mark(identified=True, tuned=True)
-    made.end(True, "The wheels drove as designed.")
+    made.store_verdict(True, "The wheels drove as designed.")
     return tmp_path
 
 
@@ -117,8 +117,8 @@ def test_no_table_is_cut_and_the_page_does_not_scroll_sideways(passed, tmp_path,
 
 def test_gains_that_have_not_driven_are_not_called_passed(passed, tmp_path):
     made = CommissioningLog(passed)
-    made.changes([])
-    made.end(False, "stopped: a wheel settles late")
+    made.store_changes([])
+    made.store_verdict(False, "stopped: a wheel settles late")
     with Browser(tmp_path / "profile") as browser:
         browser.open(passed / "report.html", 1280)
         text = browser.value("document.body.innerText")
