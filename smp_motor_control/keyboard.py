@@ -13,17 +13,14 @@ from smp_motor_control import WHEELS
 from smp_motor_control.errors import check_positive
 from smp_motor_control.fields import described
 
-ARROWS: Mapping[str, str] = {"A": "up", "B": "down", "C": "right", "D": "left"}
+ARROWS: Mapping[str, str] = {"A": "w", "B": "s", "C": "d", "D": "a"}
+"""Letter of an arrow key, by the end of its escape sequence."""
 
 BODY_KEYS: Mapping[str, tuple[float, float]] = {
     "w": (1.0, 0.0),
-    "up": (1.0, 0.0),
     "s": (-1.0, 0.0),
-    "down": (-1.0, 0.0),
     "a": (0.0, 1.0),
-    "left": (0.0, 1.0),
     "d": (0.0, -1.0),
-    "right": (0.0, -1.0),
     "q": (1.0, 1.0),
     "e": (1.0, -1.0),
     "z": (-1.0, -1.0),
@@ -31,7 +28,7 @@ BODY_KEYS: Mapping[str, tuple[float, float]] = {
 }
 """Factors of the linear and the angular speed, by key."""
 
-WHEEL_KEYS: Mapping[str, float] = {"w": 1.0, "up": 1.0, "s": -1.0, "down": -1.0}
+WHEEL_KEYS: Mapping[str, float] = {"w": 1.0, "s": -1.0}
 
 _SEQUENCE = re.compile(r"\x1b(?:\[|O)[0-9;]*([A-Za-z~])|\x1b|(.)", re.DOTALL)
 

@@ -20,6 +20,8 @@ nothing.
 import math
 import re
 from collections.abc import Sequence
+from functools import reduce
+from operator import xor
 from typing import NamedTuple
 
 from smp_motor_control.errors import ParameterError
@@ -43,10 +45,7 @@ class BoardState(NamedTuple):
 
 def checksum(text: str) -> str:
     """Return the exclusive-or of the characters as two hexadecimal digits."""
-    total = 0
-    for character in text.encode("ascii", "replace"):
-        total ^= character
-    return f"{total:02X}"
+    return f"{reduce(xor, text.encode('ascii', 'replace'), 0):02X}"
 
 
 def encode(text: str) -> bytes:

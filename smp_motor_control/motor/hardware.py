@@ -181,14 +181,12 @@ class DrivenMotor:
         if settings.current_sensor and entry.knows_current:
             current = leads * self.motor.current + self._random.gauss(0.0, settings.current_noise)
         if settings.velocity_window == 0:
-            velocity = turned * self.motor.speed
+            velocity, angle = turned * self.motor.speed, turned * self.motor.angle
         else:
             velocity = self._speed.step(time, count)
             velocity = self._last_velocity if math.isnan(velocity) else velocity
             self._last_velocity = velocity
-        angle = self._speed.total * entry.encoder.angle_per_count
-        if settings.velocity_window == 0:
-            angle = turned * self.motor.angle
+            angle = self._speed.total * entry.encoder.angle_per_count
         gearbox = entry.gearbox
         return Sample(
             self._last_voltage,

@@ -45,6 +45,9 @@ this client; requests must be idempotent."""
 
 POLL_PERIOD_S = 0.02
 DISCOVERY_S = 1.0  # discovery time on an idle machine
+MAX_SEARCHES, EQUAL_SEARCHES = 15, 4
+"""Largest number of searches for wheels, and equal results in a row that end them."""
+
 HALT_S = 1.5  # halt after which the last commands of others have timed out
 GET, SET = "get_parameters", "set_parameters_atomically"
 
@@ -138,12 +141,20 @@ class RobotClient:
         topics = {f"{wheel}/{topic}": partial(take, wheel) for wheel in wheels}
         return self.listen(kind, topics, quality)
 
-    def find_wheels(self) -> list[str]:
-        """Return the wheels whose hardware is discovered in the robot's namespace."""
-        self.spin(DISCOVERY_S)
+    def find_wheels(self) -> tuple[str, ...]:
+        """Return the wheels whose hardware is discovered in the robot's namespace.
+
+        On a busy machine they are discovered seconds apart: wait until no further one appears.
+        """
         pattern = re.compile(re.escape(self._absolute_name("")) + r"(\w+)/motor_state")
-        topics = [name for name, _ in self.node.get_topic_names_and_types()]
-        return [found[1] for name in sorted(topics) if (found := pattern.fullmatch(name))]
+        found: list[tuple[str, ...]] = []
+        while len(found) < MAX_SEARCHES:
+            self.spin(DISCOVERY_S)
+            topics = sorted(name for name, _ in self.node.get_topic_names_and_types())
+            found.append(tuple(match[1] for name in topics if (match := pattern.fullmatch(name))))
+            if found[-1] and found[-EQUAL_SEARCHES:] == [found[-1]] * EQUAL_SEARCHES:
+                break
+        return found[-1]
 
     def wait_for_wheels(self, wheels: Sequence[str], timeout: float) -> dict[str, float]:
         """Wait until every wheel has reported for half a second; return their rates [Hz].

@@ -202,7 +202,7 @@ def request_real_time(node: Node, priority: int, affinity: tuple[int, ...]) -> l
     refused = []
     for what, ask in asked.items():
         try:
-            for thread in _threads():
+            for thread in map(int, os.listdir("/proc/self/task")):  # also those of the middleware
                 with contextlib.suppress(ProcessLookupError):
                     ask(thread)
         except (OSError, ValueError, OverflowError, AttributeError) as error:
@@ -212,14 +212,6 @@ def request_real_time(node: Node, priority: int, affinity: tuple[int, ...]) -> l
     gc.freeze()
     gc.disable()
     return refused
-
-
-def _threads() -> list[int]:
-    """Return all threads of this process, including those of the middleware."""
-    try:
-        return [int(name) for name in os.listdir("/proc/self/task")]
-    except OSError:
-        return [0]
 
 
 def make_node() -> WheelPid:

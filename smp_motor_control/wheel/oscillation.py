@@ -10,6 +10,8 @@ from collections import deque
 from collections.abc import Sequence
 from typing import NamedTuple
 
+import numpy as np
+
 MIN_AMPLITUDE = 0.3  # amplitudes up to this are ignored [rad/s], as by the fault detector
 
 MIN_AMPLITUDE_SHARE = 0.25
@@ -122,12 +124,8 @@ class Oscillation:
 
 def _find_cycle(halves: Sequence[tuple[float, float]]) -> Swing | None:
     """Return the cycle of the half periods; None when their periods scatter."""
-    instants, peaks = zip(*halves)
-    periods = [after - before for before, after in zip(instants, instants[2:])]
-    period = sum(periods) / len(periods)
-    scatter = math.sqrt(sum((one - period) ** 2 for one in periods) / len(periods))
-    return (
-        Swing(sum(peaks) / len(peaks), 1.0 / period)
-        if scatter < MAX_PERIOD_SCATTER * period
-        else None
-    )
+    instants, peaks = np.array(halves).T
+    periods = instants[2:] - instants[:-2]
+    if not periods.std() < MAX_PERIOD_SCATTER * periods.mean():
+        return None
+    return Swing(float(peaks.mean()), float(1.0 / periods.mean()))

@@ -35,9 +35,6 @@ AMPLITUDE, DURATION = 6.0, 15.0
 UNFINISHED = "recording"  # folder of a recording until it is complete
 DISCOVERY_S = 2.0  # time in which a running controller is discovered [s]
 REPORT_TIMEOUT_S = 15.0  # of the first states of all wheels
-MAX_SEARCHES, EQUAL_SEARCHES = 15, 4
-"""Largest number of searches for wheels [1 s each], and equal results in a row that end them."""
-
 UNRELIABLE = "unreliable_identification"
 """Code of the finding on an identification unsuitable for design."""
 
@@ -86,7 +83,7 @@ def _commission(arguments: argparse.Namespace, folder: Path, known: Mapping[str,
     # The client exits last, so that excite has ended when the controllers are restored.
     with connect(commission.NAME, ros) as client, Processes(folder / "logs") as processes:
         _say("looking for the wheels that report, which takes some 5 s")
-        wheels = tuple(dict.fromkeys(arguments.wheel or ())) or find_wheels(client)
+        wheels = tuple(dict.fromkeys(arguments.wheel or ())) or client.find_wheels()
         robot = steps.Robot(processes, client, wheels or WHEELS, folder, ros, bounds)
         rates = client.wait_for_wheels(robot.wheels, REPORT_TIMEOUT_S)
         print("; ".join(f"{wheel} reports at {rate:.0f} Hz" for wheel, rate in rates.items()))
@@ -303,16 +300,6 @@ def _verify(session: Session, designed: driving.DesignSet) -> str:
     if own:
         now = f"the wheel_pid that was started for {', '.join(own)} has ended"
     return f"{did}; {'the gains are set in the running controllers' if trial.kept else now}."
-
-
-def find_wheels(client: Any) -> tuple[str, ...]:
-    """Return the wheels that report; on a busy machine they are discovered seconds apart."""
-    looks: list[tuple[str, ...]] = []
-    while len(looks) < MAX_SEARCHES:
-        looks.append(tuple(client.find_wheels()))
-        if looks[-1] and looks[-EQUAL_SEARCHES:] == [looks[-1]] * EQUAL_SEARCHES:
-            break
-    return looks[-1]
 
 
 def report_unreliable_motors(estimates: Mapping[str, Estimate]) -> list[Finding]:

@@ -14,7 +14,6 @@ import numpy as np
 from smp_motor_control import get_controller_name
 from smp_motor_control.arrays import Array
 from smp_motor_control.encoder import unwrap
-from smp_motor_control.motor.parameters import Gearbox
 from smp_motor_ident.bag.decode import read_columns
 from smp_motor_ident.bag.storage import Table
 from smp_motor_ident.cli import applying, steps
@@ -183,9 +182,9 @@ def compute_wheel_angle(state: Table, hardware: Hardware) -> Array:
     """Return the wheel's angle from counts, if there are any."""
     if not hardware.counts_per_revolution:
         return state.columns["position"]
-    turn = 2 * np.pi / hardware.counts_per_revolution
+    angle_per_count = 2 * np.pi / hardware.counts_per_revolution / hardware.gear_ratio
     counts = unwrap(state.columns["encoder_count"], hardware.encoder_bits).astype(np.float64)
-    return Gearbox(hardware.gear_ratio).to_wheel(turn) * counts
+    return angle_per_count * counts
 
 
 def compute_wheel_speed(state: Table, hardware: Hardware) -> tuple[Array, Array]:

@@ -28,7 +28,7 @@ from smp_motor_control.excitation import SIGNALS
 from smp_motor_control.motor import Motor, MotorParameters
 from smp_motor_control.motor.file import PAPER_MOTORS, find_config
 from smp_motor_control.nodes import loopback
-from smp_motor_ident.cli import commissioning, demonstration, interruption, lab, lab_designs, steps
+from smp_motor_ident.cli import demonstration, interruption, lab, lab_designs, steps
 from smp_motor_ident.cli.processes import ProcessError, Processes, connect, free_domain
 from smp_motor_ident.errors import ParameterError
 from smp_motor_ident.report import words
@@ -70,7 +70,7 @@ def work(arguments: argparse.Namespace) -> int:
         else:
             print("looking for the wheels that report, which takes some 5 s", flush=True)
             check_wheel_names(tuple(arguments.wheel or WHEELS))
-            wheels = tuple(arguments.wheel or ()) or commissioning.find_wheels(client)
+            wheels = tuple(arguments.wheel or ()) or client.find_wheels()
             robot = steps.Robot(processes, client, wheels or WHEELS, folder, ros, bounds)
             client.wait_for_wheels(robot.wheels, timeout=15.0)
         served = arguments.host, arguments.port, not arguments.no_browser

@@ -47,7 +47,7 @@ def test_wheel_mode_drives_the_selected_wheels_alone():
     for key in ("m", "3", "s"):
         keyboard.press(key, 0.0)
     assert keyboard.wheels(0.0) == {w: -1.5 if w == WHEELS[2] else 0.0 for w in WHEELS}
-    for key in ("0", "up"):
+    for key in ("0", "w"):
         keyboard.press(key, 0.0)
     assert set(keyboard.wheels(0.0).values()) == {1.5}
 
@@ -76,8 +76,8 @@ def test_speed_steps_are_bounded_and_undo_each_other():
     ("text", "keys"),
     [
         ("wW", ["w", "w"]),
-        ("\x1b[A\x1bOB\x1b[C\x1b[D", ["up", "down", "right", "left"]),
-        ("\x1b[1;5A", ["up"]),
+        ("\x1b[A\x1bOB\x1b[C\x1b[D", ["w", "s", "d", "a"]),
+        ("\x1b[1;5A", ["w"]),
         ("\x1b[5~x", ["x"]),
         ("\x1b", []),
         ("\x1b[", ["["]),

@@ -14,8 +14,8 @@ class Client:
     def __exit__(self, *_: object) -> None:
         pass
 
-    def find_wheels(self) -> list[str]:
-        return [self.wheel]
+    def find_wheels(self) -> tuple[str, ...]:
+        return (self.wheel,)
 
     def wait_for_wheels(self, wheels, timeout) -> dict[str, float]:
         return dict.fromkeys(wheels, self.rate)
