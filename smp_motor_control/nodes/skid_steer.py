@@ -272,14 +272,14 @@ class SkidSteerNode(Node):
                 )
         if self._commands.has_two_publishers:
             problems.append((runtime.WARN, describe_two_publishers(self, "cmd_vel")))
-        told = [f"{wheel}: {what}" for wheel, what in self._feedback.problems.items()]
-        told += [
+        faults = [f"{wheel}: {what}" for wheel, what in self._feedback.problems.items()]
+        faults += [
             f"{wheel}: motor_state has no stamp; its driver must set it"
             for wheel, no in self._unstamped.items()
             if no
         ]
-        if told and not settings.open_loop:
-            problems.append((runtime.WARN, "; ".join(told)))
+        if faults and not settings.open_loop:
+            problems.append((runtime.WARN, "; ".join(faults)))
         if now - self._refused_at < REPORT_TIME_S:
             problems.append((runtime.WARN, f"cmd_vel {self._refused}"))
         if self._unheard:

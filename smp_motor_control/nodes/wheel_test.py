@@ -10,7 +10,7 @@ import math
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, NamedTuple
 
 from sensor_msgs.msg import BatteryState
 
@@ -30,23 +30,34 @@ Law = Callable[[float], float]
 Counter = Callable[[MotorState], float]
 
 
+class Row(NamedTuple):
+    """One sample of a wheel."""
+
+    stamp: float  # [s]
+    age: float  # on arrival [s]
+    command: float  # voltage commanded after the previous sample [V]
+    voltage: float  # reported [V]
+    velocity: float  # [rad/s]
+    position: float  # [rad]
+    count: float  # total counts, or the motor's angle [rad] without an encoder
+    phase: float  # number of the phase
+
+
 @dataclass
 class WheelRecording:
     """Samples of one wheel."""
 
-    # stamp [s], age on arrival [s], commanded and reported voltage [V], velocity [rad/s],
-    # position [rad], counts, number of the phase
-    rows: list[tuple[float, ...]] = field(default_factory=list)
+    rows: list[Row] = field(default_factory=list)
 
     def turned(self, since: int) -> float:
         """Return the counts turned since a row."""
         if len(self.rows) <= since:
             return 0.0
-        return abs(self.rows[-1][6] - self.rows[since][6])
+        return abs(self.rows[-1].count - self.rows[since].count)
 
     def position_problem(self) -> str:
         """Return the fault of the position and its remedy; empty without a fault."""
-        samples = [WheelSample(row[0], row[5], row[4]) for row in self.rows]
+        samples = [WheelSample(row.stamp, row.position, row.velocity) for row in self.rows]
         if not samples:
             return ""
         travel = WheelTravel(samples[0])
@@ -103,7 +114,7 @@ class WheelTest:
     def _answer(self, wheel: str, message: MotorState) -> None:
         stamp = seconds(message.header.stamp)
         age = self._client.node.get_clock().now().nanoseconds * 1e-9 - stamp
-        self.recordings[wheel].rows.append((
+        self.recordings[wheel].rows.append(Row(
             stamp, age, self._commands[wheel], message.voltage, message.velocity,
             message.position, self._counters[wheel](message), float(self._phase),
         ))  # fmt: skip

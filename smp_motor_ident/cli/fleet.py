@@ -100,8 +100,8 @@ def identify_one(path: str, settings: tuple[Any, ...]) -> list[fleet.Row]:
                 rows.append(_make_row(path, **about, failure=str(error)))
                 continue
             held = {**found.combinations, **found.parameters}
-            told = ((name, held.get(name)) for name in fleet.QUANTITIES)
-            values = {name: q for name, q in told if q is not None and q.value is not None}
+            known = ((name, held.get(name)) for name in fleet.QUANTITIES)
+            values = {name: q for name, q in known if q is not None and q.value is not None}
             verdict = dict(fit_percent=found.fit_percent.validation, unreliable=found.unreliable)
             rows.append(_make_row(path, **about, values=values, **verdict))
     except SmpError as error:

@@ -82,7 +82,7 @@ class Server:
         self._laboratory.send = self._send
         if not _is_loopback(self._host):
             print(
-                f"WARNING: served on {self._host}, not encrypted: whoever has the address below, "
+                f"WARNING: served on {self._host}, not encrypted: anyone with the address below, "
                 "with this machine's network address in it, can drive the robot",
                 flush=True,
             )
@@ -237,8 +237,8 @@ class Server:
         try:
             await self._perform(page, json.loads(text))
         except Exception as error:  # an invalid request must not disturb other pages
-            told = str(error) if isinstance(error, SmpError) else f"invalid request: {error!r}"
-            page.queue.put_nowait(templates.encode(["refused", told]))
+            reason = str(error) if isinstance(error, SmpError) else f"invalid request: {error!r}"
+            page.queue.put_nowait(templates.encode(["refused", reason]))
 
     async def _perform(self, page: Page, message: Any) -> None:
         wanted, driver, link = message["do"], self._driver, self._laboratory.link

@@ -246,8 +246,8 @@ class Laboratory:
         client, link = self.robot.client, self.link
         if not self._holds_controllers:
             if missing := self.robot.uncontrolled():
-                told = ", ".join(missing)
-                self.tell(f"No wheel_pid runs for {told}; one is started, and ended with lab.")
+                wheels = ", ".join(missing)
+                self.tell(f"No wheel_pid runs for {wheels}; lab starts one and ends it again.")
                 self.robot.start_controllers(missing)
             self._stack.enter_context(client.paused(self.robot.wheels))
             self._holds_controllers = True

@@ -35,7 +35,7 @@ AIMS = (
     ("maximum_sensitivity", float, "MS",
      "largest sensitivity peak Ms; default of the method margin: 1.4"),
     ("focus", ("balanced", "tracking", "load"), None,
-     "what the method margin favours: set-points, loads or both (default)"),
+     "for the method margin: set-points, loads or both (default)"),
     ("bandwidth", float, "RAD/S", "crossover frequency of the method margin"),
     ("structure", ("pi", "pid"), None, "of the controller; default: the better one"),
     ("closed_loop_time_constant", float, "S", "of the method simc"),

@@ -314,6 +314,6 @@ def provenance(
         sources = ", ".join(estimates[wheel].sources) or "unknown"
         lines.append(f"{wheel}: {estimates[wheel].model} model from {sources}")
         lines += [f"  {design.reason}", f"  {design.settling.describe()}"]
-        told = (*design.warnings, *slow_loop(design))
-        lines.extend(f"  warning: {warning}" for warning in told)
+        warnings = (*design.warnings, *slow_loop(design))
+        lines.extend(f"  warning: {warning}" for warning in warnings)
     return lines

@@ -167,11 +167,11 @@ def gear_ratio(robot: Robot) -> Iterator[Finding]:
         described, known = robot.hardware[wheel], robot.ratios.get(wheel, math.nan)
         ratio = abs(one.velocity_ratio)
         gain = one.gain / robot.gains.get(wheel, math.nan)
-        said = f"gear_ratio {described.gear_ratio:g}"
+        stated = f"gear_ratio {described.gear_ratio:g}"
         if abs(ratio - 1.0) > VELOCITY_TOLERANCE:
             yield Finding(
                 "gear_ratio", "refused",
-                f"{wheel}: reported velocity is {ratio:.3g} times what counts show with {said} "
+                f"{wheel}: reported velocity is {ratio:.3g} times what counts show with {stated} "
                 f"and {described.counts_per_revolution or 0:g} counts per revolution",
                 {"wheel": wheel, "ratio": ratio, "described": described.gear_ratio},
                 f"one of these numbers is wrong in motor_description or in the driver; with the "
@@ -180,7 +180,7 @@ def gear_ratio(robot: Robot) -> Iterator[Finding]:
         if abs(known / described.gear_ratio - 1.0) > VELOCITY_TOLERANCE:
             yield Finding(
                 "gear_ratio", "refused",
-                f"{wheel}: motor_description has {said}, the motor file {known:g}",
+                f"{wheel}: motor_description has {stated}, the motor file {known:g}",
                 {"wheel": wheel, "described": described.gear_ratio, "known": known},
                 "correct the one that is wrong",
             )  # fmt: skip

@@ -5,12 +5,12 @@ import math
 
 import pytest
 
-from smp_motor_control.nodes.wheel_test import WheelRecording
+from smp_motor_control.nodes.wheel_test import Row, WheelRecording
 
 
 def recording(position) -> WheelRecording:
     """Return 8 s of a wheel at 2 rad/s whose driver reports ``position(angle)``."""
-    rows = [(1e4 + t, 0.0, 3.0, 3.0, 2.0, position(2.0 * t), 0.0, 1.0)
+    rows = [Row(1e4 + t, 0.0, 3.0, 3.0, 2.0, position(2.0 * t), 0.0, 1.0)
             for t in (0.01 * k for k in range(800))]  # fmt: skip
     return WheelRecording(rows)
 
