@@ -206,24 +206,21 @@ class MotorPlant(Node):
                 "late commands": wheel.lease.late,
             }
             values |= {f"{wheel.name} {key}": value for key, value in of_wheel.items()}
-        rejected = [wheel.name for wheel in self._wheels if wheel.rejected]
-        late = [wheel.name for wheel in self._wheels if wheel.lease.late > wheel.late]
-        rivals = motor_writer.report_refused_writers({w.name: w.lease for w in self._wheels})
+        rejected = ", ".join(wheel.name for wheel in self._wheels if wheel.rejected)
+        late = ", ".join(wheel.name for wheel in self._wheels if wheel.lease.late > wheel.late)
         for wheel in self._wheels:
             wheel.late = wheel.lease.late
-        message = "simulating"
-        if rejected:
-            names = ", ".join(rejected)
-            message = f"refused non-finite messages: {names}; look at their publishers"
-        elif late:
-            oldest = self._wheels[0].motor.settings.command_timeout
+        # The gravest problem last
+        message = motor_writer.report_refused_writers({w.name: w.lease for w in self._wheels})
+        if late:
+            timeout = self._given.settings.drive.command_timeout
             message = (
-                f"refused commands older than {oldest:g} s: {', '.join(late)}; look at the load "
-                "and the clock of their writers"
+                f"refused commands older than {timeout:g} s: {late}; look at the load and the "
+                "clock of their writers"
             )
-        elif rivals:
-            message = rivals
-        return runtime.WARN if rejected or late or rivals else runtime.OK, message, values
+        if rejected:
+            message = f"refused non-finite messages: {rejected}; look at their publishers"
+        return runtime.WARN if message else runtime.OK, message or "simulating", values
 
 
 main = partial(runtime.run, "motor_plant", MotorPlant)

@@ -122,35 +122,26 @@ class WheelReport:
         if listed:
             message = f"{message}; in the last second: {listed}"
             level = max(level, runtime.WARN)
-        advice = [
-            text
-            for text in (
-                self._wheel.advice,
-                self._describe_oscillation(),
-                self._describe_overload(),
-            )
-            if text
-        ]
-        if self._wheel.loop.wraps_at:
-            advice.append(
-                f"encoder_count wraps at {self._wheel.loop.wraps_at} bits, unlike "
-                "motor_description: correct its encoder_bits"
-            )
-        advice += [
-            describe_two_publishers(self._node, t)
-            for t, one in self._watches.items()
-            if one.has_two_publishers
-        ]
-        if self._wheel.clock.unstamped:
-            advice.append(UNSTAMPED_TEXT)
+        wheel, clock = self._wheel, self._wheel.clock
+        warnings = (
+            wheel.advice,
+            self._describe_oscillation(),
+            self._describe_overload(),
+            wheel.loop.wraps_at
+            and f"encoder_count wraps at {wheel.loop.wraps_at} bits, unlike motor_description: "
+            "correct its encoder_bits",
+            *(describe_two_publishers(self._node, topic) for topic, one in self._watches.items()
+              if one.has_two_publishers),
+            clock.unstamped and UNSTAMPED_TEXT,
+        )  # fmt: skip
+        advice = [text for text in warnings if text]
         if advice:
             level = max(level, runtime.WARN)
-        if has_default_gains(self._wheel.settings.loop.gains):
+        if has_default_gains(wheel.settings.loop.gains):
             advice.append(UNTUNED_TEXT)
         if self._diagnostics.due:
             self._reported = totals
             gc.collect()
-        wheel, clock = self._wheel, self._wheel.clock
         values: dict[str, object] = {
             "steps": wheel.steps,
             "set-point [rad/s]": "none" if wheel.setpoint is None else wheel.setpoint,

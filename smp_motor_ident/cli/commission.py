@@ -42,7 +42,3 @@ def parser() -> Parser:
 
 
 main = partial(run, parser, "commissioning")
-
-
-if __name__ == "__main__":
-    raise SystemExit(main())

@@ -24,7 +24,3 @@ def parser() -> Parser:
 
 
 main = partial(run, parser, "demonstration")
-
-
-if __name__ == "__main__":
-    raise SystemExit(main())

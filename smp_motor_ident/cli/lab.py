@@ -38,7 +38,3 @@ def parser() -> Parser:
 
 
 main = partial(run, parser, "laboratory")
-
-
-if __name__ == "__main__":
-    raise SystemExit(main())
