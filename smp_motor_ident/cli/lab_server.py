@@ -26,7 +26,7 @@ from smp_motor_ident.report import templates
 MAX_QUEUED = 60  # messages that wait for a slow page before it gets no more samples
 MAX_MESSAGE = 10_000  # length of a request [bytes]
 WATCH_PERIOD_S = 0.03  # period of checking the page that drives
-SILENCE_TIMEOUT_S = 0.3  # silence of that page after which the wheels stop
+SILENCE_S = 0.3  # silence of that page after which the wheels stop
 TAKEOVER_AFTER_S = 2.0  # silence after which another page may take over
 HEADERS = {"Referrer-Policy": "no-referrer", "Cache-Control": "no-store"}
 POLICY = (
@@ -124,14 +124,10 @@ class Server:
         while not self._ended.is_set():
             await asyncio.sleep(WATCH_PERIOD_S)
             now, driver = time.monotonic(), self._driver
-            late, before = not late and now - before > SILENCE_TIMEOUT_S / 2, now
+            late, before = not late and now - before > SILENCE_S / 2, now
             # After a pause of this process, messages of the page may still be unread.
-            if (
-                link.armed
-                and not late
-                and (driver is None or now - driver.heard_at > SILENCE_TIMEOUT_S)
-            ):
-                link.halt(f"the page was not heard for {SILENCE_TIMEOUT_S:g} s")
+            if link.armed and not late and (driver is None or now - driver.heard_at > SILENCE_S):
+                link.halt(f"the page was not heard for {SILENCE_S:g} s")
             link.watched_at = now
 
     def _address(self) -> str:
