@@ -13,7 +13,7 @@ STAMP_JITTER_S = 0.02
 """Tolerated error of a stamp, including the angle of one count over a short interval."""
 
 CLOCK_JUMP_S = 1.0
-"""A stamp that goes back by more shows a clock that was set; by less, a late sample."""
+"""A stamp that is earlier by more shows that a clock was set; by less, a late sample."""
 
 UNFILLED_ANGLE = 1.0
 """Integrated velocity [rad] after which a constant position counts as not filled in."""
@@ -205,7 +205,7 @@ class WheelFeedback:
 
     @property
     def latest(self) -> Mapping[str, WheelSample]:
-        """The newest sample of every wheel heard so far."""
+        """The newest sample of every wheel with feedback so far."""
         return {w: k.travel.latest for w, k in self._wheels.items() if k.travel is not None}
 
     @property

@@ -26,7 +26,7 @@ from smp_motor_control.nodes.executor import PolledSubscriptions
 from smp_motor_control.nodes.robot_client import RobotClient
 
 COLUMNS = ("voltage", "current", "speed", "setpoint", "reference", "prediction")
-"""Quantities of a wheel: V, A, and the rest in rad/s at the wheel; NaN where there is none."""
+"""Quantities of a wheel: [V], [A] and [rad/s, wheel]; NaN if unknown."""
 
 SLOT_S = 0.005  # interval of the common time grid; the last sample in it counts
 MAX_LATE_SLOTS = 4  # delay of one wheel's samples after another's [slots]

@@ -75,7 +75,7 @@ class OdometryOutput:
             self._tf.publish(self._transforms)
 
     def publish_joints(self, wheels: Mapping[str, WheelSample], stamp: float) -> None:
-        """Publish the joint states of the wheels heard so far."""
+        """Publish the joint states of the wheels with feedback so far."""
         heard = [w for w in self._wheels if w in wheels and math.isfinite(wheels[w].position)]
         if not heard:
             return

@@ -28,7 +28,7 @@ IMPLAUSIBLE_RATIO = 4.0  # wheel speed relative to its maximum that shows a coun
 DEFAULT_MAX_SPEED = 250.0  # plausible speed without a limit [rad/s]
 REPORT_TIME_S = 1.5  # time for which a refused command is reported, at least once
 LOOK_PERIOD_S = 0.2  # period of checking the publishers of cmd_vel
-OWN_SETPOINTS = 32  # own set-points that are recognised when they are heard
+OWN_SETPOINTS = 32  # number of own set-points that are recognised when received
 YIELD_S = 0.3  # time for which an idle body is silent after another node's set-points
 STALLED_PERIODS = 3.0
 """Delay in periods after which a step is skipped once, to process queued messages first."""
@@ -56,7 +56,7 @@ class SkidSteerNode(Node):
         self._configure(settings)
         self._past_commands = [(0.0, 0.0), (0.0, 0.0)]  # (linear, angular) of the last two steps
         self._sent: deque[int] = deque(maxlen=OWN_SETPOINTS)  # stamps of the last set-points
-        self._others_at = -math.inf  # when another node's set-points were heard
+        self._others_at = -math.inf  # time of another node's last set-points
         self._share = 1.0
         self._late = False
         self._refused, self._refused_at = "", -math.inf

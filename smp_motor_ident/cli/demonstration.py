@@ -89,10 +89,11 @@ def _clear_folder(folder: Path) -> Path:
     return folder
 
 
-def start(robot: steps.Robot, motors: Path, rate: float) -> None:
+def start(robot: steps.Robot, motors: Path | None = None, rate: float = 200.0) -> None:
     """Start the simulated robot and wait until it reports; its controllers stay inactive."""
     processes, client = robot.processes, robot.client
-    given = ["--ros-args", "-p", f"motors_file:={motors.resolve()}", "-p", f"rate:={rate}"]
+    file = (motors or find_config(PAPER_MOTORS)).resolve()
+    given = ["--ros-args", "-p", f"motors_file:={file}", "-p", f"rate:={rate}"]
     processes.start("motor_plant", "motor_plant", *given, priority=1)
     processes.start("skid_steer", "skid_steer", priority=1)
     robot.start_controllers(WHEELS)

@@ -62,7 +62,7 @@ class Move:
     """One change of set-point in a drive."""
 
     name: str
-    begin: float  # when the wheel was first heard at the new set-point [s]
+    begin: float  # time of the first report at the new set-point [s]
     before: float  # set-point until then [rad/s, wheel]
     setpoint: float  # [rad/s, wheel]
     lasts: float  # [s]

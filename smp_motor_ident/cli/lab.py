@@ -27,9 +27,6 @@ def parser() -> Parser:
         help="speed at which an excitation stops; default: none")  # fmt: skip
     add("--max-current", type=number(0), default=0.0, metavar="A",
         help="current at which an excitation stops; default: none")  # fmt: skip
-    add("--motors", metavar="FILE", help="with --demo: its motors; default: the paper's")
-    add("--rate", type=number(0), default=200.0, metavar="HZ",
-        help="with --demo: samples per second; default 200")  # fmt: skip
     add("--domain", type=int, help="with --demo: ROS domain; default: a free one")
     add("--host", default="127.0.0.1", help="address to serve; default 127.0.0.1, this machine")
     add("--port", type=int, default=0, help="port to serve; default: a free one")

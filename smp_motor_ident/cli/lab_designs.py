@@ -17,7 +17,7 @@ from smp_motor_ident.tune.feedback import Feedback
 from smp_motor_ident.tune.reference import STEP_SHARE
 from smp_motor_ident.tune.writing import parameters
 
-NICENESS = 5  # of the process that designs
+NICENESS = 5  # of the design process
 
 
 def begin() -> None:

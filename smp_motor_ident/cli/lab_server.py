@@ -23,7 +23,7 @@ from smp_motor_ident.cli.processes import ProcessError
 from smp_motor_ident.errors import ParameterError
 from smp_motor_ident.report import templates
 
-MAX_QUEUED = 60  # messages that wait for a slow page before it gets no more samples
+MAX_QUEUED = 60  # waiting messages beyond which a slow page misses samples
 MAX_MESSAGE = 10_000  # length of a request [bytes]
 WATCH_PERIOD_S = 0.03  # period of checking the page that drives
 SILENCE_S = 0.3  # silence of that page after which the wheels stop

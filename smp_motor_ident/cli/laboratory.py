@@ -26,7 +26,6 @@ from smp_motor_control.arrays import Array
 from smp_motor_control.errors import SmpError
 from smp_motor_control.excitation import SIGNALS
 from smp_motor_control.motor import Motor, MotorParameters
-from smp_motor_control.motor.file import PAPER_MOTORS, find_config
 from smp_motor_control.nodes import loopback
 from smp_motor_ident.cli import demonstration, interruption, lab, lab_designs, steps
 from smp_motor_ident.cli.processes import ProcessError, Processes, connect, free_domain
@@ -62,11 +61,10 @@ def work(arguments: argparse.Namespace) -> int:
         Processes(folder / "logs") as processes,
         ProcessPoolExecutor(1, SPAWN, initializer=lab_designs.begin) as designs,
     ):
-        designs.submit(int)  # starts the process, which loads its modules meanwhile
+        designs.submit(int)  # start the process, which loads its modules
         if arguments.demo:
             robot = steps.Robot(processes, client, WHEELS, folder, ros, bounds)
-            motors = Path(arguments.motors) if arguments.motors else find_config(PAPER_MOTORS)
-            demonstration.start(robot, motors, arguments.rate)
+            demonstration.start(robot)
         else:
             print("looking for the wheels that report, which takes some 5 s", flush=True)
             check_wheel_names(tuple(arguments.wheel or WHEELS))
@@ -231,7 +229,7 @@ class Laboratory:
         self._jobs.put(jobs[wanted])
 
     def _wait(self, done: Callable[[], bool], moving: bool = False, name: str = "") -> None:
-        """Wait while the streams go on; raise if the wheels were stopped meanwhile."""
+        """Wait for a condition and serve the streams; raise if the wheels are stopped."""
         while True:
             interruption.check()
             if moving and not self.link.armed:
@@ -267,7 +265,7 @@ class Laboratory:
         self.link.controlled = self.link.controlled or active
         self.robot.switch("activate" if active else "deactivate")
         self.link.controlled = active
-        if active and not self.link.armed:  # a stop came meanwhile
+        if active and not self.link.armed:  # stopped during the activation
             self._activate(False)
 
     def _excite(self, asked: Mapping[str, Any]) -> None:

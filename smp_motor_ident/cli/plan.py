@@ -25,7 +25,7 @@ SIGNALS = (
 )
 """Excitations: signal, shares of amplitude and duration, and their recording."""
 
-EXTRA = "further"  # name of the recording that an identification asks for
+EXTRA = "further"  # name of a recording that the identification requests
 # Parts after the recordings
 IDENTIFYING, IDENTIFYING_AGAIN, TUNING = "identifying", "identifying again", "tuning"
 DRIVING = "driving on the new gains"
@@ -41,7 +41,7 @@ DRAWN_S, COLUMNS, BLOCKS = 4.0, 72, "▁▂▃▄▅▆▇█"
 
 @dataclass(frozen=True)
 class Recording:
-    """One signal and where it is kept."""
+    """One signal and the folder of its recording."""
 
     folder: str  # :data:`FITTED` or :data:`HELD_OUT`
     name: str
@@ -53,7 +53,7 @@ class Recording:
         return f"exciting: {self.name}"
 
     def describe(self) -> str:
-        """Return the signal in words."""
+        """Return the signal as text."""
         one = self.excitation
         band = f", {one.band[0]:.2g} to {one.band[1]:.2g} Hz" if one.band else ""
         return f"{one.amplitude:.3g} V{band}, {one.duration:.3g} s"
@@ -105,11 +105,11 @@ class Schedule:
         self._running: tuple[str, float] | None = None
 
     def add(self, name: str, kind: str, seconds: float) -> None:
-        """Plan a part, or plan it anew."""
+        """Plan a part, replacing one of the same name."""
         self._parts[name] = kind, seconds
 
     def begin(self, name: str, how: str = "") -> str:
-        """End the part under way and begin a planned one; return it and the time left in words."""
+        """End the current part and begin a planned one; return its text with the time left."""
         if self._running is not None:
             before, since = self._running
             self._took[before] = self._clock() - since
@@ -155,13 +155,13 @@ def schedule(
 
 
 def format_duration(seconds: float) -> str:
-    """Return a rounded duration in words."""
+    """Return a rounded duration as text."""
     whole = round(seconds / 5) * 5 if seconds > 20 else round(seconds)
     return f"{whole // 60} min {whole % 60} s" if whole >= 60 else f"{whole} s"
 
 
 def draw_plan(amplitude: float, duration: float, wheels: Sequence[str]) -> list[str]:
-    """Return the plan in words, each signal with its first seconds as a line of blocks."""
+    """Return the plan as text, with the first seconds of each signal as a line of blocks."""
     lines = [
         f"first: each wheel alone, some {CHECK_S:g} s: slowly until it turns, then at growing "
         f"voltages up to {amplitude:g} V, both ways; signs, gearing, dead zone, supply and load "

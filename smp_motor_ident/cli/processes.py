@@ -83,8 +83,8 @@ def _claim(domain: int) -> bool:
 class Processes:
     """A set of node processes that ends with its ``with`` block in any case.
 
-    Each is the leader of its own process group, is asked to stop by SIGINT, then by SIGTERM,
-    then killed; the kernel sends it SIGTERM if this process dies.  Its output goes to its own
+    Each leads its own process group and is stopped by SIGINT, then SIGTERM, then SIGKILL; the
+    kernel sends it SIGTERM if this process dies.  Its output goes to its own
     ``NAME.log``.
     """
 
@@ -98,7 +98,7 @@ class Processes:
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Stop all; a second Ctrl-C meanwhile does not keep any alive."""
+        """Stop all; a second Ctrl-C does not interrupt this."""
         ignored = (signal.SIGINT, signal.SIGTERM, signal.SIGTSTP)
         kept = {s: signal.signal(s, signal.SIG_IGN) for s in ignored}
         try:
@@ -186,7 +186,7 @@ def _command(node: str) -> list[str]:
 
 
 def _prepare(parent: int, priority: int) -> None:
-    """Between fork and exec: let the kernel end this process when `parent` dies."""
+    """Prepare a forked process before exec: it ends when ``parent`` dies."""
     workers.die_with_parent(signal.SIGTERM)
     if os.getppid() != parent:
         os._exit(1)

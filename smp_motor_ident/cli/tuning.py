@@ -129,7 +129,7 @@ def design_together(
 
 
 def _announce(text: str, seconds: float, wheels: Sized) -> str:
-    """Return a step in words, with its duration."""
+    """Return the text of a step with its duration."""
     return f"{text}, which takes about {seconds * len(wheels):.0f} s"
 
 
@@ -233,7 +233,7 @@ def read_estimates(source: Path) -> dict[str, Estimate]:
 def _compare(
     estimates: Mapping[str, Estimate], loops: Mapping[str, Loop], targets: Mapping[str, Any]
 ) -> str:
-    """Print the methods side by side for each wheel; return the one that most recommend."""
+    """Print the methods side by side for each wheel; return the one recommended most often."""
     votes: Counter[str] = Counter()
     reason: dict[str, str] = {}
     for wheel, estimate in estimates.items():

@@ -18,7 +18,7 @@ MAX_SETTLING_EXCESS = 20.0  # ms later than predicted: four samples
 MAX_GAIN_ERROR = 0.5  # percent
 MAX_DEVIATIONS = 3.0  # of its own standard deviations, for every parameter of a wheel
 WORST_DEVIATIONS = 4.0
-UNIT = "standard deviations, timing included,"  # the one systematic error that a simulation has
+UNIT = "standard deviations, timing included,"  # the only systematic error of a simulation
 # Of 40 numbers, some 26 of them independent, one lies beyond 3 by chance in one run of 15
 # (and beyond 4 in one of 600): so one wheel may, and none may beyond 4.
 

@@ -21,7 +21,7 @@ class SimulatedRun:
     """Measured and simulated motor speed of one stretch of data."""
 
     time: Array  # [s]
-    measured: Array  # [rad/s]; NaN where nothing was measured
+    measured: Array  # [rad/s]; NaN if not measured
     simulated: Array  # [rad/s]
 
     def powers(self) -> Array:

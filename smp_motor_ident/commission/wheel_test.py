@@ -34,7 +34,7 @@ class Trace:
     voltage: Array  # as reported [V]
     velocity: Array  # of the wheel, as reported [rad/s]
     position: Array  # of the wheel, as reported [rad]
-    count: Array  # total counts; the motor's angle [rad] where nothing counts
+    count: Array  # total counts, or the motor's angle [rad] without an encoder
     phase: Array  # number of the phase
 
     @classmethod
@@ -59,9 +59,9 @@ class Trace:
 class Phase:
     """One part of the test of a wheel."""
 
-    wheel: str  # the one that is driven
+    wheel: str  # the driven wheel
     number: int  # as in :class:`Trace`
-    # zero voltage before, growing voltage, constant voltage, zero voltage behind it
+    # zero voltage before; rising, constant and zero voltage
     kind: Literal["rest", "ramp", "hold", "coast"]
     level: float = 0.0  # voltage at the end, with its sign [V]
 

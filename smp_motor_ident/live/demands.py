@@ -50,7 +50,7 @@ def _shares(voltage: Array) -> Array:
 
 
 def _speed(record: Record) -> Array:
-    """Return the motor's speed, from counts where they are known, in any unit."""
+    """Return the speed in an arbitrary unit, from counts if they are known."""
     counts = record.count if record.hardware.counts_per_revolution else None
     if counts is None and record.velocity is not None:
         return record.velocity

@@ -8,7 +8,7 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
 
 def message_class(type_name: str) -> Any | None:
-    """Return the class of ``package/msg/Name``; None where it is not installed."""
+    """Return the class of ``package/msg/Name``; None if it is not installed."""
     package, _, rest = type_name.partition("/")
     name = rest.rpartition("/")[2]
     try:

@@ -127,7 +127,7 @@ class Player(Node):
         return True
 
     def _wait_until(self, due: float, begin: float, first: int) -> bool:
-        """Wait for a message's time, sending the clock meanwhile; False when stopped."""
+        """Wait for a message's time and publish the clock; return False when stopped."""
         while not self._ended.is_set():
             now = time.monotonic()
             if self._clock is not None and now >= self._clock_due:

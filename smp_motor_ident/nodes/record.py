@@ -69,7 +69,7 @@ class Topic:
 
 
 def subscription_qos(offered: list[QoSProfile]) -> QoSProfile:
-    """Return the strongest QoS that every one of the publishers can serve."""
+    """Return the strongest QoS that all publishers offer."""
     reliable = all(q.reliability == ReliabilityPolicy.RELIABLE for q in offered)
     latched = all(q.durability == DurabilityPolicy.TRANSIENT_LOCAL for q in offered)
     return quality(DEPTH, reliable, latched)

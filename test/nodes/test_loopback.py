@@ -34,6 +34,6 @@ def test_nodes_bind_to_loopback_and_hear_each_other(process, node, eventually):
         assert bound_addresses(one.pid) == {"127.0.0.1"}, one.command
 
 
-def test_another_middleware_gets_the_range_that_every_one_knows(monkeypatch):
+def test_another_middleware_gets_the_discovery_range_of_ros_only(monkeypatch):
     monkeypatch.setenv("RMW_IMPLEMENTATION", "rmw_cyclonedds_cpp")
     assert loopback.loopback_environment() == {"ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
