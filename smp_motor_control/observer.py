@@ -222,12 +222,12 @@ class SpeedObserver:
         self._speed += g_speed * innovation
         self.acceleration += g_acceleration * innovation
         self.load += g_load * innovation
-        unlike = self._innovation_ratio / scatter
-        if unlike > DISTRUST_RATIO or abs(self.load) > self._max_load:
+        normalised = self._innovation_ratio / scatter
+        if normalised > DISTRUST_RATIO or abs(self.load) > self._max_load:
             if self.trusted:
                 self._restart(angle, differenced)
             self.trusted = False
-        elif unlike < _TRUST_RATIO:
+        elif normalised < _TRUST_RATIO:
             self.trusted = True
         self.speed = self._speed if self.trusted else differenced
         return self.speed
@@ -294,8 +294,8 @@ class SpeedObserver:
             past.popleft()
         volt_seconds, since = 0.0, begin
         for until, held in past:
-            upto = min(until, end)
-            if upto > since:
-                volt_seconds += held * (upto - since)
-                since = upto
+            stop = min(until, end)
+            if stop > since:
+                volt_seconds += held * (stop - since)
+                since = stop
         return volt_seconds / dt

@@ -91,20 +91,20 @@ class Excite(Node):
         settings = Parameters(self, Settings).settings
         self._settings = settings
         self._outputs: list[tuple[MotorWriter, Excitation]] = []
-        self._watched: dict[str, Protection] = {}
-        self._unheard: dict[str, float] = {}
-        self._states: dict[str, PublisherWatch] = {}
+        self._protections: dict[str, Protection] = {}
+        self._silence: dict[str, float] = {}
+        self._publisher_watches: dict[str, PublisherWatch] = {}
         bounds = Bounds(speed=settings.max_speed, current=settings.max_current)
         for k, wheel in enumerate(settings.chosen()):
             signal = settings.make_signal(k)
             signal(0.0)  # initialise before the first period
             self._outputs.append((MotorWriter(self, f"{wheel}/"), signal))
-            self._watched[wheel] = Protection(bounds)
-            self._states[wheel] = PublisherWatch()
+            self._protections[wheel] = Protection(bounds)
+            self._publisher_watches[wheel] = PublisherWatch()
             topic, take = f"{wheel}/motor_state", partial(self._on_motor_state, wheel)
             self.create_subscription(MotorState, topic, take, runtime.STREAM_SUBSCRIBER)
         self._begin: float | None = None
-        self._all_heard = math.inf
+        self._connected_since = math.inf
         self._created = time.monotonic()
         self._diagnostics = runtime.Diagnostics(self, self._assess)
         self._timer = runtime.steady_timer(self, 1.0 / settings.rate, self._on_timer)
@@ -132,20 +132,20 @@ class Excite(Node):
                     "deactivate it first"
                 )
             writer.send(signal(elapsed), stamp)
-        for wheel in self._unheard:
-            self._unheard[wheel] += 1.0 / settings.rate
-            if self._unheard[wheel] > _SILENCE_S:
+        for wheel in self._silence:
+            self._silence[wheel] += 1.0 / settings.rate
+            if self._silence[wheel] > _SILENCE_S:
                 raise LimitError(
                     f"{wheel}: no motor_state for {_SILENCE_S:g} s; is its driver running?"
                 )
 
     def _on_motor_state(self, wheel: str, message: MotorState, info: Mapping[str, Any]) -> None:
-        self._unheard[wheel] = 0.0
-        self._states[wheel].hear(info)
-        if self._states[wheel].has_two_publishers:
+        self._silence[wheel] = 0.0
+        self._publisher_watches[wheel].hear(info)
+        if self._publisher_watches[wheel].has_two_publishers:
             raise LimitError(describe_two_publishers(self, f"{wheel}/motor_state"))
         stamp = runtime.seconds(message.header.stamp)
-        why = self._watched[wheel].add(stamp, message.current, message.velocity)
+        why = self._protections[wheel].add(stamp, message.current, message.velocity)
         if why and self._begin is not None:
             raise LimitError(f"{wheel}: {why}")
 
@@ -157,12 +157,12 @@ class Excite(Node):
                 f"no subscriber on {', '.join(silent)}; is the driver or motor_plant running?"
             )
         if silent:
-            self._all_heard = math.inf
+            self._connected_since = math.inf
             return False
         # Wait briefly for subscribers and wheels that are discovered but not yet connected.
-        self._all_heard = min(self._all_heard, now)
-        waited = now - self._all_heard
-        unheard = (wheel for wheel in self._watched if wheel not in self._unheard)
+        self._connected_since = min(self._connected_since, now)
+        waited = now - self._connected_since
+        unheard = (wheel for wheel in self._protections if wheel not in self._silence)
         known = all(
             p.get_subscription_count() >= self.count_subscribers(p.topic_name) for p in publishers
         ) and not any(self.count_publishers(f"{wheel}/motor_state") for wheel in unheard)

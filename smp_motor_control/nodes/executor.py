@@ -108,7 +108,7 @@ class LeanExecutor(SingleThreadedExecutor):
     def __init__(self, **options: Any) -> None:
         super().__init__(**options)
         self._waits: tuple[_WaitSet, _WaitSet] | None = None
-        self._stream_until = self._heard = 0
+        self._stream_until = self._last_message_at = 0
         self._plain: dict[Any, bool] = {}
 
     def entities(self) -> tuple[tuple[Any, ...], ...]:
@@ -168,10 +168,10 @@ class LeanExecutor(SingleThreadedExecutor):
         """Set until when to wait for messages only."""
         now = time.monotonic_ns()
         if looked:
-            in_succession = heard and now - self._heard < SERVICE_PERIOD_NS
+            in_succession = heard and now - self._last_message_at < SERVICE_PERIOD_NS
             self._stream_until = now + SERVICE_PERIOD_NS if in_succession else 0
         if heard:
-            self._heard = now
+            self._last_message_at = now
 
     def _do_guard(self, guard: Any) -> None:
         if guard is self._guard:

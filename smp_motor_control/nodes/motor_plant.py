@@ -112,8 +112,8 @@ class MotorPlant(Node):
 
     def __init__(self) -> None:
         super().__init__("motor_plant")
-        self._given = Parameters(self, Settings, self._on_change, also_known=["motors."])
-        settings = self._given.settings
+        self._ros_parameters = Parameters(self, Settings, self._on_change, also_known=["motors."])
+        settings = self._ros_parameters.settings
         entries = self._motors(settings)
         self._supply = Supply(0.0, settings.supply_resistance)
         self._nominal = max(entry.supply_voltage for entry in entries.values())
@@ -213,7 +213,7 @@ class MotorPlant(Node):
         # The gravest problem last
         message = motor_writer.report_refused_writers({w.name: w.lease for w in self._wheels})
         if late:
-            timeout = self._given.settings.drive.command_timeout
+            timeout = self._ros_parameters.settings.drive.command_timeout
             message = (
                 f"refused commands older than {timeout:g} s: {late}; look at the load and the "
                 "clock of their writers"

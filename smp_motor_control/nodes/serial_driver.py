@@ -132,7 +132,7 @@ class SerialDriver(Node):
         self._wheels = [Wheel(self, name, settings) for name in settings.wheel_names]
         self._fd: int | None = None
         self._lines = protocol.LineSplitter()
-        self._before: protocol.BoardState | None = None
+        self._last_state: protocol.BoardState | None = None
         self._heard_at = self._written_at = self._opened_at = -math.inf
         self._battery = self._supply = settings.supply_voltage
         self._damaged = self._resets = self._openings = self._dropped = 0
@@ -188,7 +188,7 @@ class SerialDriver(Node):
             self._fd = None
 
     def _discard_counts(self) -> None:
-        self._before = None
+        self._last_state = None
         for wheel in self._wheels:
             wheel.reset()
 
@@ -213,7 +213,7 @@ class SerialDriver(Node):
         return found
 
     def _take(self, state: protocol.BoardState) -> None:
-        before, self._before, self._battery = self._before, state, state.battery
+        before, self._last_state, self._battery = self._last_state, state, state.battery
         self._supply = self._usable_supply()
         dt = (
             math.nan
@@ -223,7 +223,7 @@ class SerialDriver(Node):
         if not 0.0 < dt < RESET_JUMP_S:
             self._resets += before is not None
             self._discard_counts()
-            self._before = state
+            self._last_state = state
         stamp = self.get_clock().now().to_msg()
         for wheel, count, current in zip(self._wheels, state.counts, state.currents):
             wheel.publish(count, current, self._supply, dt, stamp)
@@ -236,7 +236,7 @@ class SerialDriver(Node):
     def _write(self, now: float) -> None:
         """Send commands to all motors unless the board is silent or the line is still busy."""
         voltages = [wheel.voltage_to_send(now, self._supply) for wheel in self._wheels]
-        if self._fd is None or self._before is None or now - self._heard_at > BOARD_TIMEOUT_S:
+        if self._fd is None or self._last_state is None or now - self._heard_at > BOARD_TIMEOUT_S:
             return
         fresh = b""
         if _count_unsent_bytes(self._fd):
@@ -245,7 +245,7 @@ class SerialDriver(Node):
             termios.tcflush(self._fd, termios.TCOFLUSH)
             self._dropped += 1
             fresh = b"\n"  # terminates the partly sent command
-        line = protocol.encode_age(self._before.clock) + protocol.encode_voltages(voltages)
+        line = protocol.encode_age(self._last_state.clock) + protocol.encode_voltages(voltages)
         with contextlib.suppress(BlockingIOError):
             os.write(self._fd, fresh + line)
             self._written_at = now
@@ -298,7 +298,7 @@ class SerialDriver(Node):
     def _stop_motors(self, fd: int) -> None:
         """Flush the line, send zero and wait until it is sent."""
         termios.tcflush(fd, termios.TCOFLUSH)
-        clock = b"" if self._before is None else protocol.encode_age(self._before.clock)
+        clock = b"" if self._last_state is None else protocol.encode_age(self._last_state.clock)
         os.write(fd, b"\n" + clock + protocol.encode_voltages([0.0] * len(self._wheels)))
         end = time.monotonic() + STALE_AFTER_S
         while _count_unsent_bytes(fd) and time.monotonic() < end:

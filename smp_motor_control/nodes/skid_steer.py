@@ -41,8 +41,8 @@ class SkidSteerNode(Node):
 
     def __init__(self) -> None:
         super().__init__("skid_steer")
-        self._current = Parameters(self, Settings, self._configure)
-        settings = self._current.settings
+        self._ros_parameters = Parameters(self, Settings, self._configure)
+        settings = self._ros_parameters.settings
         robot = settings.robot
         self._command = BodyCommand()
         self._stop = StopRule()
@@ -57,7 +57,7 @@ class SkidSteerNode(Node):
         self._past_commands = [(0.0, 0.0), (0.0, 0.0)]  # (linear, angular) of the last two steps
         self._sent: deque[int] = deque(maxlen=OWN_SETPOINTS)  # stamps of the last set-points
         self._others_at = -math.inf  # time of another node's last set-points
-        self._share = 1.0
+        self._speed_scale = 1.0
         self._late = False
         self._refused, self._refused_at = "", -math.inf
         self._yaw, self._yaw_time, self._imu_stamp = math.nan, -math.inf, -math.inf
@@ -74,9 +74,9 @@ class SkidSteerNode(Node):
         best_effort = runtime.STREAM_SUBSCRIBER
         self.create_subscription(JointState, "wheel_setpoints", self._on_setpoints, best_effort)
         self._preferred = TwistStamped if settings.use_stamped_vel else Twist
-        self._unheard = ""
+        self._ignored_type = ""
         self._listen_to(self._preferred)
-        self._look = runtime.steady_timer(self, LOOK_PERIOD_S, self._follow_type)
+        self._type_timer = runtime.steady_timer(self, LOOK_PERIOD_S, self._follow_type)
         self._states = {wheel: PublisherWatch() for wheel in wheels}
         for wheel in wheels:
             self.create_subscription(
@@ -108,7 +108,7 @@ class SkidSteerNode(Node):
             self._cmd_vel, self._kind = None, others.pop()
             self.get_logger().info(f"cmd_vel is read as {self._kind.__name__}")
             others = there - {self._kind}
-        self._unheard = others.pop().__name__ if others else ""
+        self._ignored_type = others.pop().__name__ if others else ""
 
     def _configure(self, settings: Settings) -> None:
         robot = settings.robot
@@ -170,14 +170,14 @@ class SkidSteerNode(Node):
         else:
             dt = stamp - self._imu_stamp
             rate = message.angular_velocity.z
-            fresh = 0.0 < dt < self._current.settings.imu_timeout and math.isfinite(rate)
+            fresh = 0.0 < dt < self._ros_parameters.settings.imu_timeout and math.isfinite(rate)
             before = self._yaw if math.isfinite(self._yaw) else 0.0
             self._yaw = before + rate * dt if fresh else before
         self._imu_stamp, self._yaw_time = stamp, now
 
     def _on_timer(self) -> None:
         now, stamp = time.monotonic(), self._now()
-        settings = self._current.settings
+        settings = self._ros_parameters.settings
         late = now - self._last_tick > STALLED_PERIODS / settings.publish_rate
         self._late, self._last_tick = late and not self._late, now
         if self._late:
@@ -209,7 +209,7 @@ class SkidSteerNode(Node):
         self._past_commands = [(linear, angular), self._past_commands[0]]
         corrected = self._hold_heading(linear, angular, dt, now)
         left, right = self._robot.limit_wheel_speeds(linear, corrected)
-        self._share = share
+        self._speed_scale = share
         self._setpoint.header.stamp = self.get_clock().now().to_msg()
         self._sent.append(runtime.nanoseconds(self._setpoint.header.stamp))
         self._setpoint.velocity = [left] * len(self._left) + [right] * len(self._right)
@@ -218,14 +218,14 @@ class SkidSteerNode(Node):
     def _limit(self, asked: tuple[float, float], dt: float, now: float) -> tuple[float, float]:
         """Return the command limited by acceleration, jerk and the stop rule."""
         self._stop.note_setpoint(max(map(abs, asked)), now)
-        if self._stop.is_overdue(now, self._current.settings.stop_time):
+        if self._stop.is_overdue(now, self._ros_parameters.settings.stop_time):
             return 0.0, 0.0
         (v0, w0), (v1, w1) = self._past_commands
         linear = self._linear.limit(asked[0], v0, v1, dt).value
         return linear, self._angular.limit(asked[1], w0, w1, dt).value
 
     def _hold_heading(self, linear: float, angular: float, dt: float, now: float) -> float:
-        settings = self._current.settings
+        settings = self._ros_parameters.settings
         known = now - self._yaw_time <= settings.imu_timeout
         if not settings.heading_hold or not known or (linear == 0.0 and angular == 0.0):
             self._hold.reset()
@@ -233,13 +233,13 @@ class SkidSteerNode(Node):
         return self._hold.step(angular, self._yaw, dt)
 
     def _assess(self) -> tuple[bytes, str, dict[str, object]]:
-        settings, now = self._current.settings, time.monotonic()
+        settings, now = self._ros_parameters.settings, time.monotonic()
         (linear, angular), asked = self._past_commands[0], self._command.at(now)
         values: dict[str, object] = {
             "linear velocity": linear,
             "angular velocity": angular,
             "command age": self._command.age(now),
-            "scaled to": self._share,
+            "scaled to": self._speed_scale,
             "heading hold": settings.heading_hold,
         }
         problems = self._problems(settings, now)
@@ -249,8 +249,8 @@ class SkidSteerNode(Node):
             return runtime.OK, "waiting for the first cmd_vel", values
         if self._command.timed_out(now):
             return runtime.OK, "idle: no cmd_vel", values
-        if self._share < 1.0:
-            share = 100.0 * self._share
+        if self._speed_scale < 1.0:
+            share = 100.0 * self._speed_scale
             return runtime.OK, f"driving at {share:.0f} % of cmd_vel: wheel speed limit", values
         return runtime.OK, "driving", values
 
@@ -282,10 +282,10 @@ class SkidSteerNode(Node):
             problems.append((runtime.WARN, "; ".join(faults)))
         if now - self._refused_at < REPORT_TIME_S:
             problems.append((runtime.WARN, f"cmd_vel {self._refused}"))
-        if self._unheard:
+        if self._ignored_type:
             text = (
-                f"cmd_vel is also published as {self._unheard}, which is ignored; stop one of the "
-                "publishers"
+                f"cmd_vel is also published as {self._ignored_type}, which is ignored; stop one of "
+                "the publishers"
             )
             problems.append((runtime.WARN, text))
         if commanded and self._command.timed_out(now) and any(self._past_commands[0]):

@@ -185,12 +185,12 @@ class TeleopWheels(Node):
         self._show(now)
 
     def _publish(self, body_mode: bool, now: float) -> None:
-        mine = body_mode == self._keyboard.body_mode
+        is_active = body_mode == self._keyboard.body_mode
         if body_mode:
-            linear, angular = self._keyboard.body(now) if mine else (0.0, 0.0)
+            linear, angular = self._keyboard.body(now) if is_active else (0.0, 0.0)
             self._send_twist(linear, angular)
         else:
-            wheels = self._keyboard.wheels(now) if mine else dict.fromkeys(self._wheels, 0.0)
+            wheels = self._keyboard.wheels(now) if is_active else dict.fromkeys(self._wheels, 0.0)
             self._send_wheels([wheels[wheel] for wheel in self._wheels])
 
     def _send_twist(self, linear: float, angular: float) -> None:
@@ -211,18 +211,18 @@ class TeleopWheels(Node):
         state = "driving" if keyboard.driving(now) else "stopped"
         if keyboard.body_mode:
             linear, angular = keyboard.body(now)
-            takers = self._twists.get_subscription_count()
+            subscribers = self._twists.get_subscription_count()
             line = (
                 f"body mode  {keyboard.scale * speeds.linear:.2f} m/s  "
                 f"{keyboard.scale * speeds.angular:.2f} rad/s  | {state} "
                 f"{linear:+.2f} m/s {angular:+.2f} rad/s"
             )
         else:
-            takers = self._setpoints.get_subscription_count()
+            subscribers = self._setpoints.get_subscription_count()
             every = len(keyboard.selected) == len(self._wheels)
             chosen = "all" if every else min(keyboard.selected)
             line = f"wheel mode  {keyboard.scale * speeds.wheel:.2f} rad/s  {chosen}  | {state}"
-        line += "" if takers else "  (no subscriber)"
+        line += "" if subscribers else "  (no subscriber)"
         self._terminal.write(f"\r{line[: shutil.get_terminal_size().columns - 1]}\x1b[K")
 
     def _halt(self) -> None:

@@ -56,8 +56,8 @@ class WheelPid(LifecycleNode):
         runtime.refuse_impossible_transitions(self)
         self._wheel = wheel = WheelController(WheelSettings())
         check = lambda settings: wheel.check(settings.wheel)  # noqa: E731
-        self._given = Parameters(self, Settings, self._on_change, check=check)
-        settings = self._given.settings
+        self._ros_parameters = Parameters(self, Settings, self._on_change, check=check)
+        settings = self._ros_parameters.settings
         self._robot, _, name = self.get_namespace().rpartition("/")
         self._joint = settings.joint_name or get_joint_name(name)
         if self._joint == get_joint_name(""):
@@ -66,20 +66,20 @@ class WheelPid(LifecycleNode):
             )
         self._on_change(settings)
         self._entities: list[Any] = []
-        self._watches = 0
-        self._now, self._watched = time.time_ns, False
+        self._ticks = 0
+        self._now, self._has_subscribers = time.time_ns, False
 
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Create topics, reset service and diagnostics."""
         heard = runtime.STREAM_SUBSCRIBER
         self._writer = MotorWriter(self)
-        self._shown = self.create_publisher(PidState, "pid_state", runtime.STREAM_PUBLISHER)
+        self._pid_states = self.create_publisher(PidState, "pid_state", runtime.STREAM_PUBLISHER)
         listen = self.create_subscription
         self._states, self._setpoints = PublisherWatch(), PublisherWatch()
         asked = with_watch(self._setpoints, self._on_setpoint)
         self._entities = [
             (MotorWriter.destroy, self._writer),
-            (self.destroy_publisher, self._shown),
+            (self.destroy_publisher, self._pid_states),
             (self.destroy_subscription,
              listen(MotorState, "motor_state", self._on_motor_state, heard)),
             (self.destroy_subscription,
@@ -164,16 +164,16 @@ class WheelPid(LifecycleNode):
         voltage = wheel.take_feedback(message, nanoseconds, self._now(), time.monotonic())
         if voltage is not None:
             self._writer.send(voltage, stamp)
-            if self._watched and wheel.answer is not None:
-                self._shown.publish(pid_state(wheel, self._joint, stamp))
+            if self._has_subscribers and wheel.answer is not None:
+                self._pid_states.publish(pid_state(wheel, self._joint, stamp))
         if wheel.state is not self._report.shown:
             self._report.update()
 
     def _on_timer(self) -> None:
         """Check for lost feedback and, less often, for subscribers, clock and publishers."""
-        self._watches += 1
-        if self._watches % _SLOW_TICKS == 0:
-            self._watched = self._shown.get_subscription_count() > 0
+        self._ticks += 1
+        if self._ticks % _SLOW_TICKS == 0:
+            self._has_subscribers = self._pid_states.get_subscription_count() > 0
             simulated = self.get_clock().ros_time_is_active
             self._now = self._ros_now if simulated else time.time_ns
             self._wheel.has_two_publishers = self._states.has_two_publishers

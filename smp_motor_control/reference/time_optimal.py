@@ -131,10 +131,10 @@ def _find_switching_times(
         bound = math.copysign(top, target - speed)
         return motor.tau * math.log((bound - speed) / (bound - target)), 0.0
     brake = -math.copysign(top, state[1])
-    even = motor.after(state, brake, motor.time_to_zero_acceleration(state, brake))[0]
-    bound = math.copysign(top, target - even)
+    braked_speed = motor.after(state, brake, motor.time_to_zero_acceleration(state, brake))[0]
+    bound = math.copysign(top, target - braked_speed)
 
-    def ending(first: float) -> tuple[float, float]:
+    def finish(first: float) -> tuple[float, float]:
         """Return the final speed and braking time after a first phase."""
         switch = motor.after(state, bound, first)
         if switch[1] * bound <= 0.0:  # still decelerating from the other direction
@@ -144,18 +144,18 @@ def _find_switching_times(
 
     short, long = 0.0, 0.25 * motor.tau
     for _ in range(_BISECTIONS):
-        if (ending(long)[0] - target) * bound >= 0.0:
+        if (finish(long)[0] - target) * bound >= 0.0:
             break
         short, long = long, 2.0 * long
     for _ in range(_BISECTIONS):
         if long - short < 1e-4 * long:
             break
         middle = 0.5 * (short + long)
-        if (ending(middle)[0] - target) * bound >= 0.0:
+        if (finish(middle)[0] - target) * bound >= 0.0:
             long = middle
         else:
             short = middle
-    return long, ending(long)[1]
+    return long, finish(long)[1]
 
 
 _Legs = tuple[tuple[float, float], ...]
@@ -178,10 +178,10 @@ def _fit_whole_samples(
         u = (target - state[0] * left) / (1.0 - left)
         return ((u, samples * sample_time),) if abs(u) <= most else None
     best: _Legs | None = None
-    for late in sorted({min(max(int(lag) + k, 1), samples - 1) for k in (-1, 0, 1, 2)}):
-        if late < 1:
+    for second_samples in sorted({min(max(int(lag) + k, 1), samples - 1) for k in (-1, 0, 1, 2)}):
+        if second_samples < 1:
             continue
-        lengths = (samples - late) * sample_time, late * sample_time
+        lengths = (samples - second_samples) * sample_time, second_samples * sample_time
         free = motor.after(motor.after(state, 0.0, lengths[0]), 0.0, lengths[1])
         one = motor.after(motor.after((0.0, 0.0), 1.0, lengths[0]), 0.0, lengths[1])
         two = motor.after((0.0, 0.0), 1.0, lengths[1])

@@ -176,11 +176,11 @@ class _Plant:
         moved = np.column_stack((held.transition[0], held.forced[0]))
         self._advance: list[list[float]] = np.vstack((turned, moved)).tolist()
         self.samples = round(min(max(4.0 * (tau + model.delay) / dt, MIN_SAMPLES), MAX_SAMPLES))
-        self._late = 1 + math.ceil(min(model.delay / dt, MAX_SAMPLES) - 1e-9)
+        self._delay_samples = 1 + math.ceil(min(model.delay / dt, MAX_SAMPLES) - 1e-9)
 
     def rest(self) -> None:
         self.angle = self.speed = self.rate = 0.0
-        self._held = [0.0] * self._late
+        self._held = [0.0] * self._delay_samples
 
     def step(self, voltage: float, static: float) -> float:
         """Apply a voltage; return the mean speed until the next sample."""
@@ -236,8 +236,8 @@ def _explain_instability(settings: LoopSettings, plant: _Plant) -> str:
     low, high = 0.0, 1.0
     for _ in range(5):
         share = 0.5 * (low + high)
-        fewer = replace(gains, p=share * gains.p, i=share * gains.i, d=share * gains.d)
-        if _is_stable(replace(settings, gains=fewer), plant):
+        scaled = replace(gains, p=share * gains.p, i=share * gains.i, d=share * gains.d)
+        if _is_stable(replace(settings, gains=scaled), plant):
             low = share
         else:
             high = share

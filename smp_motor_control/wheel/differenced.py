@@ -27,18 +27,18 @@ RESPONSE_LAG_SAMPLES = 1.5
 
 
 def differenced_gains(
-    gains: PidGains, model: MotorModel, ratio: float, late: float, window: int
+    gains: PidGains, model: MotorModel, ratio: float, difference_lag: float, window: int
 ) -> PidGains:
     """Return gains, at most those given, for counts differenced over ``window`` samples.
 
-    ``late`` is the lag of the difference, half a window [s]; ``ratio`` is the gear ratio.
+    ``difference_lag`` is half a window [s]; ``ratio`` is the gear ratio.
     """
     tau, gain = model.time_constant, model.dc_gain / ratio
     p = gains.p or tau * gains.i
     i = min(gains.i, p / tau)
-    lag = model.delay + (1.0 + 2.0 * RESPONSE_LAG_SAMPLES / window) * late
+    lag = model.delay + (1.0 + 2.0 * RESPONSE_LAG_SAMPLES / window) * difference_lag
     s = 1j * np.geomspace(0.01 / (tau + lag), 2.0 * np.pi / lag, 1000)
     response = np.exp(-s * lag) / (model.time_constant_product * s * s + tau * s + 1.0)
-    nearest = float((-gain * (p + i / s) * response).real.max())
-    share = 1.0 / max(1.0, gain * p, nearest / (1.0 - 1.0 / MAX_SENSITIVITY))
+    largest_real_part = float((-gain * (p + i / s) * response).real.max())
+    share = 1.0 / max(1.0, gain * p, largest_real_part / (1.0 - 1.0 / MAX_SENSITIVITY))
     return replace(gains, p=share * p, i=share * i, d=0.0)

@@ -189,8 +189,8 @@ class WheelLoop:
         """Return the change of the differenced speed by one count [rad/s]."""
         if self._count is None or self._gearbox is None or self._encoder is None or not dt > 0.0:
             return 0.0
-        over = 1 if self._differenced is None else self.settings.difference_window
-        return self._gearbox.to_wheel(self._encoder.angle_per_count) / (over * dt)
+        window = 1 if self._differenced is None else self.settings.difference_window
+        return self._gearbox.to_wheel(self._encoder.angle_per_count) / (window * dt)
 
     def _measured(self, dt: float, velocity: float, count: int, voltage: float) -> float:
         self.source = "measured"

@@ -167,8 +167,8 @@ class Identifier(Node):
 
     def __init__(self) -> None:
         super().__init__("identifier")
-        self._given = Parameters(self, Settings)
-        settings = self._given.settings
+        self._ros_parameters = Parameters(self, Settings)
+        settings = self._ros_parameters.settings
         monitors = _make_monitors(settings)
         self._wheels = {
             name: Wheel(self, name, settings.window, monitors.get(name)) for name in settings.wheels
@@ -193,7 +193,7 @@ class Identifier(Node):
         A pause in proportion to its cost follows every estimate; the last window before samples
         stop arriving skips the pause.
         """
-        settings, now = self._given.settings, time.monotonic()
+        settings, now = self._ros_parameters.settings, time.monotonic()
         for wheel in self._wheels.values():
             ceased, wheel.seen = wheel.window.last == wheel.seen, wheel.window.last
             if wheel.running or (wheel.seen and wheel.seen == wheel.estimated):
@@ -225,7 +225,7 @@ class Identifier(Node):
             (found, cost), wheel.running = wheel.running.result(), None
             if self._compiled:
                 since = max(self._not_before, time.monotonic())
-                self._not_before = since + cost / self._given.settings.share
+                self._not_before = since + cost / self._ros_parameters.settings.share
             self._compiled = True
             if isinstance(found, Estimate):
                 why = "; ".join(f.message for f in found.findings if f.severity == "unreliable")
@@ -273,9 +273,11 @@ class Identifier(Node):
             if wheel.monitor is not None
         ]
         try:
-            history.append(Path(self._given.settings.history), [e for e in entries if e.values])
+            history.append(
+                Path(self._ros_parameters.settings.history), [e for e in entries if e.values]
+            )
         except OSError as error:
-            self.get_logger().error(f"{self._given.settings.history}: {error.strerror}")
+            self.get_logger().error(f"{self._ros_parameters.settings.history}: {error.strerror}")
 
     def on_stop(self) -> None:
         """Stop without waiting for a running estimate."""
