@@ -66,7 +66,7 @@ def work(arguments: argparse.Namespace) -> int:
         w: driving.evaluate_changes(w, one, driving.find_moves(segments, one.answers), designed)[0]
         for w, one in driven.items()
     }
-    verdict.show(truth, designed, changes)
+    verdict.print_results(truth, designed, changes)
     checks = verdict.check_estimates(truth, designed.estimates)
     if stall <= MAX_STALL_S:
         checks += verdict.check_drive(changes)

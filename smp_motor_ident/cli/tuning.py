@@ -48,7 +48,7 @@ def work(arguments: argparse.Namespace) -> int:
     check_free(files, arguments.force)
     estimates = read_estimates(arguments.source)
     wheels, reasons = design_together(estimates, arguments)
-    show(wheels)
+    print_designs(wheels)
     if files:
         write(files, wheels, estimates, arguments, reasons)
     if arguments.apply:
@@ -244,7 +244,7 @@ def _compare(
         print(f"\n{wheel}\n{TABLE_HEAD}")
         for method, result in results.items():
             mark = "*" if method == name else " "
-            print(f"{mark} {method:16s} {row(result)}")
+            print(f"{mark} {method:16s} {format_design(result)}")
     chosen = votes.most_common(1)[0][0]
     print(f"\n* recommended: {chosen}. {reason[chosen]}\n")
     return chosen
@@ -273,10 +273,10 @@ TABLE_HEAD = (
     f"  {'method':16s} {'p':>8} {'i':>8} {'d':>8} {'PM':>4} {'GM':>6} {'Ms':>5} {'settle':>8} "
     f"{'over':>6} {'load':>8} {'volts':>7} {'noise':>7}"
 )
-"""Of a table of designs."""
+"""Head of a table of designs."""
 
 
-def row(result: Design | DesignError) -> str:
+def format_design(result: Design | DesignError) -> str:
     """Return a design as a row under :data:`TABLE_HEAD`."""
     if isinstance(result, DesignError):
         return str(result)
@@ -288,17 +288,20 @@ def row(result: Design | DesignError) -> str:
     )
 
 
-def show(wheels: WheelSet) -> None:
+def print_designs(wheels: WheelSet) -> None:
     """Print the designs of all wheels, and the reasons for them."""
     print(f"  {'wheel':16s}{TABLE_HEAD[18:]}")
     for wheel, design in wheels.designs.items():
-        print(f"  {wheel:16s} {row(design)}")
+        print(f"  {wheel:16s} {format_design(design)}")
     print(wheels.reason)
     for wheel, design in wheels.designs.items():
-        print(f"{wheel}: {design.settling.describe()}")
-        print(f"{wheel}: {design.reason}")
-        for warning in (*design.warnings, *slow_loop(design)):
-            print(f"{wheel}: warning: {warning}")
+        print("".join(f"{wheel}: {line}\n" for line in describe_design(design)), end="")
+
+
+def describe_design(design: Design) -> list[str]:
+    """Return settling, reason and warnings of a design."""
+    warnings = (f"warning: {one}" for one in (*design.warnings, *slow_loop(design)))
+    return [design.settling.describe(), design.reason, *warnings]
 
 
 def provenance(
@@ -313,7 +316,5 @@ def provenance(
     for wheel, design in wheels.designs.items():
         sources = ", ".join(estimates[wheel].sources) or "unknown"
         lines.append(f"{wheel}: {estimates[wheel].model} model from {sources}")
-        lines += [f"  {design.reason}", f"  {design.settling.describe()}"]
-        warnings = (*design.warnings, *slow_loop(design))
-        lines.extend(f"  warning: {warning}" for warning in warnings)
+        lines += [f"  {line}" for line in describe_design(design)]
     return lines

@@ -51,7 +51,7 @@ def _compare_with_truth(entry: MotorEntry, estimate: Estimate) -> list[tuple[str
     return [(n, t, held[n]) for n, t in truth.items() if n in held and held[n].value is not None]
 
 
-def show(
+def print_results(
     truth: Mapping[str, MotorEntry],
     designed: DesignSet,
     changes: Mapping[str, Sequence[Change]],

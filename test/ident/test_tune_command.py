@@ -16,7 +16,7 @@ from smp_motor_control import WHEELS
 from smp_motor_control.pid import PidGains
 from smp_motor_ident.cli import tuning
 from smp_motor_ident.cli.tune import main, parser
-from smp_motor_ident.cli.tuning import row
+from smp_motor_ident.cli.tuning import format_design
 from smp_motor_ident.record import Hardware
 from smp_motor_ident.report import tuning_page
 from smp_motor_ident.report.document import identification_document, read_identification
@@ -103,8 +103,8 @@ def test_small_gains_are_shown_with_their_digits():
         performance=SimpleNamespace(settling=2.07, overshoot=0.0, load_integral=6.62e-4,
                                     peak_voltage=4.04, control_noise=0.1),
     )  # fmt: skip
-    assert row(design).split()[:3] == ["0.000149", "0.0015", "0"]
-    assert "0.000662" in row(design)
+    assert format_design(design).split()[:3] == ["0.000149", "0.0015", "0"]
+    assert "0.000662" in format_design(design)
 
 
 @pytest.mark.parametrize("export", [[], ["--export", "arduino_pid"]])
