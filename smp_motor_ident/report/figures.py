@@ -93,17 +93,20 @@ def residual_charts(wheel: str, tests: ResidualTests) -> list[Chart]:
     ):
         if found is None:
             continue
-        outside = np.abs(found.value) > found.band
-        within, beyond = (np.where(which, found.value, np.nan) for which in (~outside, outside))
+        lag, value = found.lag, found.value
+        if kind == "autocorrelation":  # at lag 0 it is 1 by definition
+            lag, value = lag[lag > 0], value[lag > 0]
+        outside = np.abs(value) > found.band
+        within, beyond = (np.where(which, value, np.nan) for which in (~outside, outside))
         curves = (
             Curve("within the band", within, "good", "bars"),
             Curve("outside", beyond, "bad", "bars"),
         )
         charts.append(Chart(
             name=f"{kind.split()[0]}-{wheel}", title=f"Residual {kind}",
-            x_label="lag [samples]", y_label="correlation", x=found.lag, curves=curves,
+            x_label="lag [samples]", y_label="correlation", x=lag, curves=curves,
             lines=(-found.band, 0.0, found.band),
-            summary=f"{np.sum(outside)} of {found.lag.size} lags lie outside ±{found.band:.3g}.",
+            summary=f"{np.sum(outside)} of {lag.size} lags lie outside ±{found.band:.3g}.",
         ))  # fmt: skip
     return charts
 

@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
+from smp_motor_ident.chain.catalogue import rebuild_chain
 from smp_motor_ident.report import figures, summary, templates, words
 from smp_motor_ident.report.comparison import compare
 from smp_motor_ident.report.drawing import Chart
@@ -79,7 +80,7 @@ def _motor(estimate: Estimate, report: Report) -> dict[str, Any]:
         "messages": shown,
         "other": other,
         "gains": _gains(estimate, report),
-        "candidates": estimate.candidates,
+        "chain": [component.title for component in rebuild_chain(estimate.chain).components],
         "charts": [*fit, *residuals, *frequency, *since],
         "history": since,
         "fit": fit,
@@ -97,7 +98,7 @@ def _gains(estimate: Estimate, report: Report) -> tuple[str, str]:
     if found is None:
         return f"No gains: {tuning.reason}", ""
     gains = f"p {found.gains.p:.4g}, i {found.gains.i:.4g}, d {found.gains.d:.4g}"
-    return f"Gains, in volts per wheel rad/s: {gains}; as a file under", ""
+    return f"Gains of wheel_pid, in volts and rad/s of the wheel: {gains}; parameter file:", ""
 
 
 def _row(name: str, quantity: Quantity, doubt: int | None) -> dict[str, Any]:

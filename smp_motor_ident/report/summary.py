@@ -69,8 +69,8 @@ def judge(estimate: Estimate) -> tuple[str, str]:
 def describe_fit(estimate: Estimate) -> str:
     """Return how well the simulated speed fits the measured one."""
     known = (
-        (estimate.fit_percent.validation, "to data that the model was not fitted to"),
-        (estimate.fit_percent.estimation, "to those that it was fitted to"),
+        (estimate.fit_percent.validation, "on held-out data"),
+        (estimate.fit_percent.estimation, "on the data of the fit"),
     )
     parts = [f"{percent:.1f} % {where}" for percent, where in known if percent is not None]
     return f"Fit of the simulated speed: {', '.join(parts)}." if parts else ""

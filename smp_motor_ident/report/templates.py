@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Pages that stand alone: a template, with all that it needs in itself."""
 
+import re
 from collections.abc import Sequence
 from importlib import resources
 from typing import Any
@@ -8,7 +9,7 @@ from typing import Any
 import jinja2
 import msgspec
 import numpy as np
-from markupsafe import Markup
+from markupsafe import Markup, escape
 
 from smp_motor_ident.report import words
 from smp_motor_ident.report.drawing import Chart, packed, svg
@@ -51,6 +52,7 @@ def _environment() -> jinja2.Environment:
         "label": words.label,
         "sentence": words.to_sentence,
         "shares": _keep_together,
+        "code": _set_code,
     }
     return environment
 
@@ -59,6 +61,11 @@ def _keep_together(shares: str) -> Markup:
     """Return a list whose lines break at its commas only."""
     whole = Markup('<span class="share">{}</span>')
     return Markup(", ").join(whole.format(one) for one in shares.split(", "))
+
+
+def _set_code(sentence: str) -> Markup:
+    """Return a sentence with the names in backticks as code."""
+    return Markup(re.sub("`([^`]+)`", r"<code>\1</code>", str(escape(sentence))))
 
 
 def text(name: str) -> str:

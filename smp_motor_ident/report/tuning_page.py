@@ -190,15 +190,18 @@ def _rows(found: Design) -> list[tuple[str, str, str]]:
         ("Gain margin", *_banded(bands.gain_margin, 1.0, "")),
         ("Largest sensitivity Ms", *_banded(bands.sensitivity, 1.0, "")),
         ("Overshoot", *_banded(bands.overshoot, 1.0, " %")),
-        ("Settling to 2 %, planned transition included", *_banded(bands.settling, 1e3, " ms")),
+        ("Settling within 2 % of a planned change", *_banded(bands.settling, 1e3, " ms")),
         (
-            f"Planned transition of {settling.change:.3g} rad/s",
+            f"Duration of a planned change by {settling.change:.3g} rad/s"
+            f"{', the same for all wheels' if settling.common else ''}",
             f"{1e3 * settling.transition:.3g} ms",
-            "common to all wheels" if settling.common else "",
+            "",
         ),
         ("Settling of an abrupt change, feedback alone", f"{1e3 * settling.abrupt:.3g} ms", ""),
         ("Control noise", f"{1e3 * found.performance.control_noise:.3g} mV", ""),
-        ("p, i, d", f"{gains.p:.4g}, {gains.i:.4g}, {gains.d:.4g}", "V per wheel rad/s"),
+        ("p", f"{gains.p:.4g} V s/rad", ""),
+        ("i", f"{gains.i:.4g} V/rad", ""),
+        ("d", f"{gains.d:.4g} V s²/rad", ""),
     ]
 
 
@@ -237,8 +240,8 @@ def tuning_charts(wheels: Mapping[str, Curves], limit: float, prefix: str = "") 
         )  # fmt: skip
 
     return [
-        chart("step", "Change of set-point", "wheel speed [rad/s]"),
-        chart("load", "Load that takes 1 V", "wheel speed [rad/s]"),
+        chart("step", "Response to a change of set-point", "wheel speed [rad/s]"),
+        chart("load", "Response to a load of 1 V", "wheel speed [rad/s]"),
         chart("gain", "Loop gain: magnitude", "magnitude", "xy", (1.0,)),
         chart("phase", "Loop gain: phase", "phase [deg]", "x", (-180.0,)),
         chart("sensitivity", f"Sensitivity (line: Ms {limit:g})", "|S|", "x", (limit,)),

@@ -49,7 +49,8 @@ def label(name: str) -> str:
 def put_within(name: str) -> str:
     """Return a quantity as it is written within a sentence."""
     text = label(name)
-    return text if text[:2].isupper() else text[0].lower() + text[1:]
+    proper = text[:2].isupper() or text.startswith("Coulomb")
+    return text if proper else text[0].lower() + text[1:]
 
 
 def model(name: str) -> str:

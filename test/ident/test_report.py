@@ -20,7 +20,7 @@ from smp_motor_ident.report.figures import Comparison, frequency_charts, residua
 from smp_motor_ident.report.html import Report, render
 from smp_motor_ident.report.summary import find_doubted
 from smp_motor_ident.report.tuning_page import tuning_charts
-from smp_motor_ident.result import Quantity, ResidualTests, Share
+from smp_motor_ident.result import ChainRecord, Correlation, Quantity, ResidualTests, Share
 from smp_motor_ident.tune.curves import Curves
 
 
@@ -197,6 +197,33 @@ def test_the_chart_of_the_residuals_shows_what_the_test_has_judged():
     assert np.isnan(outside.y[1])
     assert inside.y[1] == 0.01
     assert np.isnan(cross.curves[1].y).all()  # independent: none outside
+
+
+def test_the_autocorrelation_at_lag_zero_is_not_drawn_as_outside():
+    every = Correlation(np.arange(3.0), np.array([1.0, 0.01, 0.02]), 0.1)
+    tests = ResidualTests(autocorrelation=every, cross_correlation=every)
+    own, cross = residual_charts("w", tests)
+    assert own.x.tolist() == [1.0, 2.0] and own.summary.startswith("0 of 2 lags")
+    assert cross.x.tolist() == [0.0, 1.0, 2.0]
+
+
+def test_the_model_is_told_by_the_components_of_its_chain_in_words():
+    chain = ChainRecord(("friction", "dead_zone", "angle", "first_order"))
+    known = replace(estimate(current=False), model="first_order", chain=chain)
+    text = render(Report({known.wheel: known}))
+    assert "<summary>Model: first order</summary>" in text
+    assert "Coulomb friction, dead zone of the driver, angle, first order." in text
+    assert "candidate" not in text.split("<main>")[1].split("</main>")[0]
+    bare = render(Report({known.wheel: replace(known, chain=ChainRecord())}))
+    assert "Components from command" not in bare
+
+
+def test_names_in_backticks_are_set_as_code_and_nothing_else_is_trusted():
+    said = Finding("scale", "warning", "see `gap` <b>", advice="state `current_accuracy`")
+    known = replace(estimate(), findings=(said,))
+    text = render(Report({known.wheel: known}))
+    assert "See <code>gap</code> &lt;b&gt;." in text
+    assert "State <code>current_accuracy</code>." in text
 
 
 def test_frequency_response_of_data_is_that_of_the_system_they_come_from():

@@ -128,7 +128,7 @@ def test_the_card_names_unreliable_values_and_systematic_errors(browser, file):
     shares = "± 3 % (current scale), ± 0.43 % (current smoothing), ± 0.22 % (current low-pass)"
     assert row(browser, "Resistance")[1:] == ["12.92 ± 0.13 Ω", shares]
     fit = browser.value("document.querySelector('#front_left .fit').textContent")
-    assert "96.8 % to data that the model was not fitted to" in fit
+    assert "96.8 % on held-out data" in fit
     gains = browser.value("document.querySelector('#front_left .gains').textContent")
     assert "tune 'my results' --output gains.yaml --accept-unreliable" in gains
 

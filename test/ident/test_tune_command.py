@@ -144,9 +144,10 @@ def test_tune_the_tuning_page_and_the_file_state_one_settling(identified, capsys
         stated = entries[wheel]["settling"]
         rows = {name: held for name, *held in shown["choices"][-1]["rows"]}
         settles = f"{1e3 * stated['value']:.3g} ms"
-        assert rows["Settling to 2 %, planned transition included"][0] == settles
-        transition, common = rows[f"Planned transition of {stated['change']:.3g} rad/s"]
-        assert transition == f"{1e3 * stated['transition']:.3g} ms" and "common" in common
+        assert rows["Settling within 2 % of a planned change"][0] == settles
+        planned = f"Duration of a planned change by {stated['change']:.3g} rad/s"
+        transition, _ = rows[f"{planned}, the same for all wheels"]
+        assert transition == f"{1e3 * stated['transition']:.3g} ms"
         (line,) = [x for x in told.splitlines() if x.startswith(f"{wheel}: settles")]
         assert f"in {settles}" in line and f"transition of {transition} included" in line
         # One transition for all, also where the page asks for less bandwidth: as slow or slower.
