@@ -60,7 +60,7 @@ def _environment() -> jinja2.Environment:
 def _keep_together(shares: str) -> Markup:
     """Return a list whose lines break at its commas only."""
     whole = Markup('<span class="share">{}</span>')
-    return Markup(", ").join(whole.format(one) for one in shares.split(", "))
+    return Markup(", ").join(whole.format(one) for one in shares.split(", ") if one)
 
 
 def _set_code(sentence: str) -> Markup:

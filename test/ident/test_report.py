@@ -212,10 +212,11 @@ def test_the_model_is_told_by_the_components_of_its_chain_in_words():
     known = replace(estimate(current=False), model="first_order", chain=chain)
     text = render(Report({known.wheel: known}))
     assert "<summary>Model: first order</summary>" in text
-    assert "Coulomb friction, dead zone of the driver, angle, first order." in text
+    words = "Coulomb friction, dead zone of the driver, angle (speed sensor), first order (motor)."
+    assert words in text
     assert "candidate" not in text.split("<main>")[1].split("</main>")[0]
     bare = render(Report({known.wheel: replace(known, chain=ChainRecord())}))
-    assert "Components from command" not in bare
+    assert "Components of the chain" not in bare
 
 
 def test_names_in_backticks_are_set_as_code_and_nothing_else_is_trusted():
