@@ -40,8 +40,8 @@ from smp_motor_ident.errors import DesignError
 from smp_motor_ident.result import Estimate, Quantity
 from smp_motor_ident.tune import METHODS, Design, Loop, design
 from smp_motor_ident.tune.feedback import Feedback, spectral_radius
-from smp_motor_ident.tune.margins import batch_margins, grid_for
-from smp_motor_ident.tune.motors import draw_motors, motors_of
+from smp_motor_ident.tune.margins import batch_margins, make_grid
+from smp_motor_ident.tune.motors import draw_motors, make_motors
 from smp_motor_ident.tune.plant import sample
 from smp_motor_ident.tune.problem import Problem
 
@@ -146,9 +146,9 @@ def load_step(motor, controller, conditions):
     return float(np.trapezoid(np.abs(speed), t))
 
 
-def at_sensitivity(plant, shape: Feedback, peak: float) -> Feedback:
+def scale_to_sensitivity(plant, shape: Feedback, peak: float) -> Feedback:
     """Scale a rule's gains by the largest factor that gives the wanted Ms."""
-    omega = grid_for(plant, 400)
+    omega = make_grid(plant, 400)
     base = plant.response(omega) * shape.response(omega, plant.sample_time)
     low, high = 1e-3, 10.0
     for _ in range(50):
@@ -236,7 +236,7 @@ def try_design(outcome: Outcome, motor, one: Design, conditions, estimate) -> No
 
 def compare_with_rules(outcome: Outcome, motor, one: Design, conditions, estimate, loop) -> None:
     """Compare the recommended design with SIMC and Ziegler-Nichols at the same Ms."""
-    plant = sample(motors_of(estimate), loop)
+    plant = sample(make_motors(estimate), loop)
     top = SUPPLY / combinations(motor)[0]
     ours = {share: step(motor, from_gains(one.gains), conditions, share * top, one)[0]
             for share in SHARES}  # fmt: skip
@@ -244,7 +244,7 @@ def compare_with_rules(outcome: Outcome, motor, one: Design, conditions, estimat
     outcome.possible = [soonest(motor, conditions, share * top) for share in SHARES]
     for rule in ("simc", "ziegler_nichols"):
         shape = METHODS[rule].solve(Problem(plant, loop))
-        same = at_sensitivity(plant, shape, one.margins.sensitivity)
+        same = scale_to_sensitivity(plant, shape, one.margins.sensitivity)
         controller = Controller(same.p, same.i, same.d, same.filter_time, tracking=same.p / same.i)
         load = load_step(motor, controller, conditions)
         # One that never settles within the record counts as slow as the record is long.

@@ -10,7 +10,13 @@ from numpy.typing import NDArray
 from smp_motor_control.arrays import Array, Integers
 from smp_motor_control.motor.parameters import Gearbox
 from smp_motor_ident.bag import checks, clock, counter, mapping, units
-from smp_motor_ident.bag.axis import Motor, Series, resample_to_output, select_finite, unwrap_counts
+from smp_motor_ident.bag.axis import (
+    Context,
+    Series,
+    resample_to_output,
+    select_finite,
+    unwrap_counts,
+)
 from smp_motor_ident.bag.storage import Table
 from smp_motor_ident.errors import BagError
 from smp_motor_ident.limits import MAX_COUNT_STEP, MAX_STRAY_ROW_SHARE
@@ -25,7 +31,7 @@ def assemble(
     wheel: str, plan: mapping.MotorMap, hardware: Hardware, tables: Mapping[str, Table], source: str
 ) -> Record:
     """Make one motor's record."""
-    motor = Motor(wheel, plan, hardware, tables, source)
+    motor = Context(wheel, plan, hardware, tables, source)
     for topic in plan.topics:
         motor.findings += tables[topic].findings
         if not tables[topic].logged.size:
@@ -34,19 +40,20 @@ def assemble(
     if axis_name is None or "voltage" not in plan.signals:
         missing = "voltage" if axis_name else "velocity, position or count"
         raise BagError(f"{motor.where}: the mapping gives no {missing}")
-    clocks = _clock(motor)
+    clocks = _choose_times(motor)
     arrivals = [topic for topic, time in clocks.items() if time is tables[topic].log]
     times, leaps = clock.remove_leaps(clocks, plan.gap)
     if leaps:
         text = (
-            f"the time leaps by up to {_span(max(leaps))} in {len(leaps)} places: the clock was "
-            "set while recording, or these are runs of several days; a new segment each"
+            f"the time leaps by up to {_describe_span(max(leaps))} in {len(leaps)} places: the "
+            "clock was set while recording, or these are runs of several days; each leap begins a "
+            "new segment"
         )
-        motor.tell("clock_set", text, "warning", times=len(leaps), longest=max(leaps))
+        motor.report("clock_set", text, "warning", times=len(leaps), longest=max(leaps))
     if plan.clock == "auto":
         times |= {topic: _fit_arrivals(motor, topic, times[topic]) for topic in arrivals}
     given = {name: signal for name, signal in plan.signals.items() if name != "time"}
-    series = {n: _series(motor, n, signal, times[signal.topic]) for n, signal in given.items()}
+    series = {n: _take_series(motor, n, signal, times[signal.topic]) for n, signal in given.items()}
     for name in ("voltage", axis_name):
         if not np.isfinite(series[name].value).any():
             raise BagError(f"{motor.where}: {given[name].field} holds no number; map another field")
@@ -55,18 +62,18 @@ def assemble(
         _drop_incomplete_samples(motor, series, axis_name)
     elif axis_name == "count":  # a whole number has no NaN
         series["count"] = select_finite(series["count"])
-    _check(motor, series)
+    _check_series(motor, series)
     if together:
         _drop_incomplete_samples(motor, series, axis_name)
     return resample_to_output(motor, series, axis_name)
 
 
-def _span(seconds: float) -> str:
+def _describe_span(seconds: float) -> str:
     days = seconds / 86_400
     return f"{days / 365.25:.3g} years" if days > 700 else f"{days:.3g} days"
 
 
-def _fit_arrivals(motor: Motor, topic: str, time: Integers) -> Integers:
+def _fit_arrivals(motor: Context, topic: str, time: Integers) -> Integers:
     """Return arrival times fitted to the sender's period, unchanged if it has none."""
     table = motor.tables[topic]
     together = np.diff(time) == 0
@@ -81,7 +88,7 @@ def _fit_arrivals(motor: Motor, topic: str, time: Integers) -> Integers:
     if table.clocked and not beat.repeated:
         # The motion shows whether header stamps are the sampling instants.
         signal = next((s for n, s in motor.plan.signals.items() if n in _MOTION), None)
-        if clock.measure_rhythm(time).regular or signal is None or signal.topic != topic:
+        if clock.measure_sampling(time).regular or signal is None or signal.topic != topic:
             return time
         motion = table.columns[signal.field].astype(np.float64)
         if not is_on_beat(beat, time, motion):
@@ -91,29 +98,29 @@ def _fit_arrivals(motor: Motor, topic: str, time: Integers) -> Integers:
         f"(median latency {beat.latency * 1e-6:.3g} ms)"
     )
     period, deviation, latency = (1e-9 * x for x in (beat.period, beat.deviation, beat.latency))
-    motor.tell("arrival_beat", text, period=period, deviation=deviation, latency=latency)
+    motor.report("arrival_beat", text, period=period, deviation=deviation, latency=latency)
     return beat.time
 
 
-def _check(motor: Motor, series: dict[str, Series]) -> None:
+def _check_series(motor: Context, series: dict[str, Series]) -> None:
     """Drop impossible values and an unsigned current; sign a magnitude by its direction."""
     if "direction" in series:
         way, volts = series.pop("direction"), series["voltage"].value
         stray = MAX_STRAY_ROW_SHARE * np.count_nonzero(volts)
         if min(np.sum(volts > 0), np.sum(volts < 0)) > stray:
             text = "the voltage has a sign already, so that the direction is not used; leave it out"
-            motor.tell("direction_not_used", text)
+            motor.report("direction_not_used", text)
         else:
             series["voltage"] = checks.apply_direction(series["voltage"], way, motor.where)
     for name in sorted(series, key=lambda name: name != "count"):
         value = series[name].value
         if name == "count":  # a wrap is not a jump
-            if last := counter.is_full(value):
+            if last := counter.find_full_count(value):
                 raise BagError(
                     f"{motor.where}: the count stays at {last}, the end of a counter's range: "
                     "it is full; record a wider one, or one that wraps"
                 )
-            if checks.is_of_two_publishers(value.astype(np.float64)):
+            if checks.has_two_publishers(value.astype(np.float64)):
                 raise BagError(
                     f"{motor.where}: the count jumps to and fro between two courses, so that two "
                     "nodes published it at once; end one of them and record anew"
@@ -132,7 +139,9 @@ def _check(motor: Motor, series: dict[str, Series]) -> None:
         if bad.any():
             worst = float(np.abs(value[bad]).max())
             text = f"{name}: {int(bad.sum())} values with impossible jumps (up to {worst:.4g})"
-            motor.tell("impossible_jump", f"{text} were left out", "warning", values=int(bad.sum()))
+            motor.report(
+                "impossible_jump", f"{text} were left out", "warning", values=int(bad.sum())
+            )
             if name == "count":  # a whole number has no NaN: the samples go
                 time = series[name].time
                 alike = [k for k, signal in series.items() if np.array_equal(signal.time, time)]
@@ -145,23 +154,23 @@ def _check(motor: Motor, series: dict[str, Series]) -> None:
             "current: it is positive in both directions, so it is the supply's current or has lost "
             "its sign; it was left out"
         )
-        motor.tell("unsigned_current", text, "warning")
+        motor.report("unsigned_current", text, "warning")
     ways = [series[name].value for name in ("position", "count") if name in series]
     moved = any(np.nan_to_num(np.diff(way)).any() for way in ways)
     if moved and "velocity" in series and not np.nan_to_num(series["velocity"].value).any():
         del series["velocity"]
         text = "velocity: it is 0 while the motor turns: its driver does not fill it in"
-        motor.tell("velocity_not_filled", f"{text}; it was left out", "warning")
+        motor.report("velocity_not_filled", f"{text}; it was left out", "warning")
 
 
-def _clock(motor: Motor) -> dict[str, Integers]:
+def _choose_times(motor: Context) -> dict[str, Integers]:
     """Return the time [ns] of every topic's messages, all on one clock."""
     tables = {topic: motor.tables[topic] for topic in motor.plan.topics}
     if all(table.clocked for table in tables.values()):
         return {topic: table.logged for topic, table in tables.items()}
-    stamps = {topic: _stamp(motor, table) for topic, table in tables.items()}
+    stamps = {topic: _read_stamps(motor, table) for topic, table in tables.items()}
     if motor.plan.clock == "log":
-        motor.tell("time_base", "time: log times, as clock=log requests")
+        motor.report("time_base", "time: log times, as clock=log requests")
         return {topic: table.logged for topic, table in tables.items()}
     judged = {t: clock.judge_stamps(stamps[t], table.logged) for t, table in tables.items()}
     poor = {topic: reason for topic, reason in judged.items() if reason}
@@ -176,7 +185,7 @@ def _clock(motor: Motor) -> dict[str, Integers]:
     offsets = [fit.offset for fit in fits.values()]
     if not poor and max(offsets) - min(offsets) < clock.MAX_CLOCK_OFFSET_NS:
         text = "time: header stamps (the instants of sampling, free of transport delay)"
-        motor.tell("time_base", text)
+        motor.report("time_base", text)
         _report_offset(motor, next(iter(tables)), fits)
         if any(
             len(clock.split_at_resets(stamp)) > 1 for stamp in stamps.values() if stamp is not None
@@ -184,11 +193,11 @@ def _clock(motor: Motor) -> dict[str, Integers]:
             return _times_across_resets(motor, tables, stamps)
         return {topic: stamp for topic, stamp in stamps.items() if stamp is not None}
     if not fits:
-        motor.tell("time_base", f"time: log times ({next(iter(poor.values()))})")
+        motor.report("time_base", f"time: log times ({next(iter(poor.values()))})")
         return {topic: table.logged for topic, table in tables.items()}
     because = "; ".join(f"{topic}: {why}" for topic, why in poor.items())
     text = "time: header stamps moved to the recorder's clock by their offset and drift, because "
-    motor.tell("time_base", text + (because or "the topics' clocks differ"))
+    motor.report("time_base", text + (because or "the topics' clocks differ"))
     moved = {topic: table.logged for topic, table in tables.items()}
     for topic, fit in fits.items():
         _report_offset(motor, topic, fits, always=True)
@@ -199,13 +208,13 @@ def _clock(motor: Motor) -> dict[str, Integers]:
 
 
 def _times_across_resets(
-    motor: Motor, tables: Mapping[str, Table], stamps: Mapping[str, Integers | None]
+    motor: Context, tables: Mapping[str, Table], stamps: Mapping[str, Integers | None]
 ) -> dict[str, Integers]:
     """Return times for a recording during which the clock of the stamps was set back."""
     if len(tables) > 1:
         motor.findings.pop()
         text = "time: log times (the clock of the header stamps was set back meanwhile)"
-        motor.tell("time_base", text)
+        motor.report("time_base", text)
         return {topic: table.logged for topic, table in tables.items()}
     topic, table = next(iter(tables.items()))
     stamp = stamps[topic]
@@ -215,11 +224,11 @@ def _times_across_resets(
     pauses = [max(int(log[begin] - log[begin - 1]), least) for begin, _ in parts[1:]]
     time = clock.concatenate_parts([stamp], [parts], pauses)[0]
     text = f"{topic}: the clock of the header stamps was set back {len(pauses)} times"
-    motor.tell("clock_set_back", f"{text}; a new segment each", "warning", times=len(pauses))
+    motor.report("clock_set_back", f"{text}; a new segment each", "warning", times=len(pauses))
     return {topic: time}
 
 
-def _stamp(motor: Motor, table: Table) -> Integers | None:
+def _read_stamps(motor: Context, table: Table) -> Integers | None:
     """Return a topic's stamps: the field that the mapping names, else the header's."""
     signal = motor.plan.signals.get("time")
     if signal is None or motor.tables.get(signal.topic) is not table:
@@ -232,7 +241,7 @@ def _stamp(motor: Motor, table: Table) -> Integers | None:
 
 
 def _report_offset(
-    motor: Motor, topic: str, fits: Mapping[str, clock.ClockFit], always: bool = False
+    motor: Context, topic: str, fits: Mapping[str, clock.ClockFit], always: bool = False
 ) -> None:
     fit = fits[topic]
     if always or abs(fit.offset) > 1e9 or abs(fit.drift) > 1e-4:
@@ -240,15 +249,15 @@ def _report_offset(
             f"{topic}: the recorder's clock is {fit.offset * 1e-9:+.6f} s from the header's, "
             f"drifting by {fit.drift * 1e6:+.0f} ppm"
         )
-        motor.tell("clock_offset", text, offset=fit.offset * 1e-9, drift=fit.drift)
+        motor.report("clock_offset", text, offset=fit.offset * 1e-9, drift=fit.drift)
 
 
-def _series(motor: Motor, name: str, signal: mapping.Signal, time: Integers) -> Series:
+def _take_series(motor: Context, name: str, signal: mapping.Signal, time: Integers) -> Series:
     """Return one signal's valid samples in SI at the motor shaft, in order."""
     table = motor.tables[signal.topic]
     column = table.columns.get(signal.field)
     there = table.present.get(signal.field)
-    order = np.zeros(0, np.int64) if column is None else _order(motor, time, table, signal.topic)
+    order = np.zeros(0, np.int64) if column is None else _sort(motor, time, table, signal.topic)
     keep = order if there is None else order[there[order]]
     if column is None or not keep.size:
         raise BagError(f"{motor.where}: no message of {signal.topic} has {signal.field}")
@@ -260,7 +269,7 @@ def _series(motor: Motor, name: str, signal: mapping.Signal, time: Integers) -> 
     return Series(time[keep], _convert(motor, name, signal, values), number, bits)
 
 
-def _order(motor: Motor, time: Integers, table: Table, topic: str) -> Integers:
+def _sort(motor: Context, time: Integers, table: Table, topic: str) -> Integers:
     """Return the indices that sort the samples by time without duplicates; report repairs."""
     steps = np.diff(time)
     if np.all(steps > 0):
@@ -272,7 +281,7 @@ def _order(motor: Motor, time: Integers, table: Table, topic: str) -> Integers:
     where = topic or "rows"
     if late:
         text = f"{where}: {late} samples came out of order and were sorted"
-        motor.tell("samples_reordered", text, samples=late)
+        motor.report("samples_reordered", text, samples=late)
     if doubles := int((~first).sum()):
         again = order[~first]
         before = order[np.flatnonzero(~first) - 1]
@@ -283,12 +292,12 @@ def _order(motor: Motor, time: Integers, table: Table, topic: str) -> Integers:
         ]
         text = f"{where}: {doubles} samples with a repeated time were left out"
         text += f" although they differ in {', '.join(differ)}" if differ else " (duplicates)"
-        motor.tell("duplicate_samples", text, "warning" if differ else "note", samples=doubles)
+        motor.report("duplicate_samples", text, "warning" if differ else "note", samples=doubles)
     chosen: Integers = order[first]
     return chosen
 
 
-def _convert(motor: Motor, name: str, signal: mapping.Signal, raw: NDArray[Any]) -> NDArray[Any]:
+def _convert(motor: Context, name: str, signal: mapping.Signal, raw: NDArray[Any]) -> NDArray[Any]:
     """Return values in SI at the motor shaft; counts as int64."""
     if name == "count":
         exact = signal.scale == 1 and signal.offset == 0
@@ -297,7 +306,7 @@ def _convert(motor: Motor, name: str, signal: mapping.Signal, raw: NDArray[Any])
         return raw.astype(np.float64) * signal.scale + signal.offset
     plain = signal.scale == 1 and signal.offset == 0 and not motor.plan.own
     where = signal.topic.rpartition("/")[2] if signal.field == "data" else signal.field
-    named = units.unit_of(name, "", where) if plain else ""
+    named = units.find_unit(name, "", where) if plain else ""
     unit = signal.unit or named or units.check_unit(name, "")
     values: Array = raw.astype(np.float64)
     values *= signal.scale
@@ -327,17 +336,17 @@ def _convert(motor: Motor, name: str, signal: mapping.Signal, raw: NDArray[Any])
         if width:
             turns = width / (2 * np.pi)
             at = "one turn" if abs(turns - 1) < 1e-9 else f"{turns:.6g} turns"
-            motor.tell("angle_wraps", f"position: wraps at {at}; it was unwrapped")
+            motor.report("angle_wraps", f"position: wraps at {at}; it was unwrapped")
     if name in ("velocity", "position") and shaft == "wheel":
         values = Gearbox(motor.hardware.gear_ratio).to_motor(values)
     return values
 
 
-def _clamp_to_supply(motor: Motor, volts: Array, supply: float) -> Array:
+def _clamp_to_supply(motor: Context, volts: Array, supply: float) -> Array:
     """Return the commanded voltage clamped to the supply."""
     beyond = int(np.sum(np.abs(volts) > supply * (1 + 1e-6)))  # allow for float32 rounding
     if beyond:
-        motor.tell(
+        motor.report(
             "beyond_full_scale",
             f"{beyond} samples of the command are beyond 100 % (up to "
             f"{100 * np.nanmax(np.abs(volts)) / supply:.0f} %) and were clamped to it; give the "
@@ -348,7 +357,7 @@ def _clamp_to_supply(motor: Motor, volts: Array, supply: float) -> Array:
     return np.clip(volts, -supply, supply)
 
 
-def _drop_incomplete_samples(motor: Motor, series: dict[str, Series], axis_name: str) -> None:
+def _drop_incomplete_samples(motor: Context, series: dict[str, Series], axis_name: str) -> None:
     """Leave out the samples of a common topic whose voltage or output is not finite."""
     axis, voltage = series[axis_name], series["voltage"]
     if not np.array_equal(axis.time, voltage.time):
@@ -366,6 +375,6 @@ def _drop_incomplete_samples(motor: Motor, series: dict[str, Series], axis_name:
         return
     what = "count" if np.isfinite(voltage.value).all() else "voltage"
     text = f"{int((~sound).sum())} samples without a finite {what} were left out"
-    motor.tell("no_voltage", text, "warning")
+    motor.report("no_voltage", text, "warning")
     alike = [name for name, signal in series.items() if np.array_equal(signal.time, axis.time)]
     series.update({name: series[name].take(sound) for name in alike})

@@ -14,13 +14,13 @@ from smp_motor_ident.bag.clock import (
     BEAT_SAMPLES,
     average_held_input,
     find_first_time,
-    measure_rhythm,
+    measure_sampling,
 )
 from smp_motor_ident.bag.counter import Unwrapped, angle_resets, report_resets, unwrap
 from smp_motor_ident.bag.drives import find_late_rows, responds_in_its_row
 from smp_motor_ident.bag.mapping import MotorMap
 from smp_motor_ident.bag.names import MOTIONS
-from smp_motor_ident.bag.storage import Table, found
+from smp_motor_ident.bag.storage import Table, make_finding
 from smp_motor_ident.errors import BagError
 from smp_motor_ident.finding import Finding, Severity
 from smp_motor_ident.record import Hardware, Record
@@ -31,7 +31,7 @@ MAX_BRIDGED_SAMPLES = 2  # samples that may be lost in a row before a new segmen
 
 
 @dataclass(eq=False)
-class Motor:
+class Context:
     """Mapping, hardware and findings of one motor while its record is made."""
 
     wheel: str
@@ -46,9 +46,9 @@ class Motor:
         """Recording and wheel, for messages."""
         return f"{self.source}: {self.wheel}"
 
-    def tell(self, code: str, text: str, severity: Severity = "note", **evidence: float) -> None:
+    def report(self, code: str, text: str, severity: Severity = "note", **evidence: float) -> None:
         """Add a finding unless it is there already."""
-        finding = found(code, text, severity, **evidence)
+        finding = make_finding(code, text, severity, **evidence)
         if finding not in self.findings:
             self.findings.append(finding)
 
@@ -72,14 +72,14 @@ class Series:
         return Series(self.time[which], self.value[which], number, self.bits)
 
 
-def resample_to_output(motor: Motor, series: dict[str, Series], axis_name: str) -> Record:
+def resample_to_output(motor: Context, series: dict[str, Series], axis_name: str) -> Record:
     """Make a record of signals with different sampling instants."""
     if "supply" in series:
         _multiply_duty_by_supply(series)
     voltage = select_finite(series["voltage"])
     axis = series[axis_name].time
     alike = np.array_equal(voltage.time, axis)
-    keep = np.ones(axis.size, bool) if alike else _find_covered_samples(motor, voltage, axis)
+    keep = np.ones(axis.size, bool) if alike else _mark_covered_samples(motor, voltage, axis)
     if keep.sum() < 2:
         raise BagError(f"{motor.where}: fewer than 2 samples have a voltage and an output")
     starts = _count_starts(motor, series, keep, axis_name)
@@ -125,26 +125,26 @@ def resample_to_output(motor: Motor, series: dict[str, Series], axis_name: str) 
 
 
 def _undo_delay(
-    motor: Motor, axis: Integers, columns: dict[str, Any], starts: Flags
+    motor: Context, axis: Integers, columns: dict[str, Any], starts: Flags
 ) -> tuple[Integers, dict[str, Any], Flags]:
     """Shift a voltage that is recorded several rows late."""
     edges = np.append(np.flatnonzero(starts), axis.size)
     longest = int(np.argmax(np.diff(edges)))
     part = slice(edges[longest], min(edges[longest + 1], edges[longest] + MAX_TESTED_ROWS))
     name, motion = next((n, v[part]) for n in MOTIONS if (v := columns.get(n)) is not None)
-    if not measure_rhythm(axis[part]).regular or not np.isfinite(motion).all():
+    if not measure_sampling(axis[part]).regular or not np.isfinite(motion).all():
         return axis, columns, starts
     if name != "velocity":
         motion = np.diff(motion, prepend=motion[:1])
     rows = find_late_rows(columns["voltage"][part], motion.astype(np.float64))
     if rows < MIN_SHIFT_ROWS:
         return axis, columns, starts
-    late = rows * measure_rhythm(axis[part]).interval * 1e-9
+    late = rows * measure_sampling(axis[part]).interval * 1e-9
     text = (
         f"the voltage is recorded {1e3 * late:.3g} ms ({rows} rows) after it acts: the motion is "
         "ahead of it, or was smoothed both ways; it was moved back"
     )
-    motor.tell("voltage_late", text, "warning", rows=rows, late=late)
+    motor.report("voltage_late", text, "warning", rows=rows, late=late)
     keep = np.concatenate([np.arange(a, b) < b - rows for a, b in pairwise(edges)])
     if not keep.any():
         raise BagError(
@@ -157,17 +157,17 @@ def _undo_delay(
     return axis[keep], kept, np.concatenate([[True], np.diff(begun) > 0])
 
 
-def _detect_hold(motor: Motor, voltage: Series, output: Series, name: str, starts: Flags) -> str:
+def _detect_hold(motor: Context, voltage: Series, output: Series, name: str, starts: Flags) -> str:
     """Return whether the motion shows that a voltage acts after its row or before it."""
     motion = output.value.astype(np.float64)
     if name != "velocity":
         motion = np.diff(motion, prepend=motion[:1])
-    gap = measure_rhythm(output.time).gap()
+    gap = measure_sampling(output.time).gap()
     motion[starts | (np.diff(output.time, prepend=output.time[:1]) > gap)] = np.nan
     if not responds_in_its_row(voltage.value, motion):
         return "after"
     text = f"the {name} responds in the row of a change of voltage: the voltage acts before its row"
-    motor.tell("held_before", f"{text} (held=before; map held=after if it did not)")
+    motor.report("held_before", f"{text} (held=before; map held=after if it did not)")
     return "before"
 
 
@@ -186,13 +186,13 @@ def _multiply_duty_by_supply(series: dict[str, Series]) -> None:
     series["voltage"] = Series(voltage.time, voltage.value * measured)
 
 
-def _find_covered_samples(motor: Motor, voltage: Series, axis: Integers) -> Flags:
+def _mark_covered_samples(motor: Context, voltage: Series, axis: Integers) -> Flags:
     """Return which output samples lie where the input is known."""
     keep: Flags = axis >= voltage.time[0] if voltage.time.size else np.zeros(axis.size, bool)
     if not keep.all():
         text = f"{int((~keep).sum())} samples before the first voltage were left out"
-        motor.tell("no_voltage_yet", text)
-    beat = measure_rhythm(voltage.time)
+        motor.report("no_voltage_yet", text)
+    beat = measure_sampling(voltage.time)
     if beat.regular:
         limit = beat.gap()
         index = np.searchsorted(voltage.time, axis, "right") - 1
@@ -200,12 +200,12 @@ def _find_covered_samples(motor: Motor, voltage: Series, axis: Integers) -> Flag
         stale = keep & (age > limit)
         if stale.any():
             text = f"{int(stale.sum())} samples were left out: no voltage came for more than "
-            motor.tell("voltage_missing", f"{text}{limit * 1e-9:g} s", "warning")
+            motor.report("voltage_missing", f"{text}{limit * 1e-9:g} s", "warning")
         keep &= ~stale
     return keep
 
 
-def _count_starts(motor: Motor, series: dict[str, Series], keep: Flags, axis_name: str) -> Flags:
+def _count_starts(motor: Context, series: dict[str, Series], keep: Flags, axis_name: str) -> Flags:
     """Unwrap a counter in place; return which kept samples begin a segment by a reset."""
     flags = np.zeros(keep.size, bool)
     flags[0] = True
@@ -226,7 +226,7 @@ def _count_starts(motor: Motor, series: dict[str, Series], keep: Flags, axis_nam
     return np.concatenate([[True], np.diff(begun) > 0])
 
 
-def unwrap_counts(motor: Motor, series: dict[str, Series]) -> Unwrapped:
+def unwrap_counts(motor: Context, series: dict[str, Series]) -> Unwrapped:
     """Return the counter without its wraps."""
     counted = series["count"]
     given = "encoder_bits" in motor.plan.hardware
@@ -252,14 +252,14 @@ def _expect_counts(series: dict[str, Series], hardware: Hardware) -> Array | Non
 
 
 def _find_gaps(
-    motor: Motor, axis: Integers, alike: bool, held: str, voltage: Series, values: Array
+    motor: Context, axis: Integers, alike: bool, held: str, voltage: Series, values: Array
 ) -> Flags:
     """Return where segments begin because samples are missing; bridge the voltage over a few."""
-    beat = measure_rhythm(axis)
+    beat = measure_sampling(axis)
     steps, missing = np.diff(axis), beat.missing(axis)
     edges = [0, *(np.flatnonzero(steps > beat.gap()) + 1).tolist(), axis.size]
     for a, b in pairwise(edges):  # each run may have its own rate
-        if (own := measure_rhythm(axis[a:b])).regular and b - a > BEAT_SAMPLES:
+        if (own := measure_sampling(axis[a:b])).regular and b - a > BEAT_SAMPLES:
             missing[a : b - 1] = own.missing(axis[a:b])
     if alike and voltage.number is not None:  # the publisher's numbers tell losses
         missing = np.maximum(np.diff(voltage.number) - 1, 0)
@@ -277,23 +277,23 @@ def _find_gaps(
     if bridged.any():
         text = f"{int(missing[bridged].sum())} samples missing in {int(bridged.sum())} places"
         text += "; their voltage was interpolated" if alike else "; the voltage there is known"
-        motor.tell("samples_missing", text, samples=int(missing[bridged].sum()))
+        motor.report("samples_missing", text, samples=int(missing[bridged].sum()))
     apart = [f.evidence for f in motor.findings if f.code in ("clock_set_back", "clock_set")]
     if cut.sum() > sum(float(e.get("times") or 0.0) for e in apart):
         text = f"{int(cut.sum())} gaps of up to {steps[cut].max() * 1e-9:.3g} s"
         text += f" ({int(missing[cut].sum())} samples missing)" if beat.regular else ""
-        motor.tell("gaps", f"{text}; a new segment begins after each", gaps=int(cut.sum()))
+        motor.report("gaps", f"{text}; a new segment begins after each", gaps=int(cut.sum()))
     if not beat.regular:
         text = (
             f"the sampling is irregular: median {beat.interval * 1e-6:.4g} ms, "
             f"from {steps.min() * 1e-6:.4g} to {steps.max() * 1e-6:.4g} ms"
         )
-        motor.tell("irregular_sampling", text)
+        motor.report("irregular_sampling", text)
     return np.concatenate([[True], cut])
 
 
 def _interpolate(
-    motor: Motor, name: str, series: Series, axis: Integers, keep: Flags
+    motor: Context, name: str, series: Series, axis: Integers, keep: Flags
 ) -> NDArray[Any] | None:
     """Return a signal at the axis's instants, NaN where it is not known."""
     if series.time.size == keep.size and np.array_equal(series.time[keep], axis):
@@ -307,20 +307,20 @@ def _interpolate(
         after = np.clip(np.searchsorted(sound.time, axis), 1, sound.time.size - 1)
         apart = sound.time[after] - sound.time[after - 1]
         exact = np.isin(axis, sound.time)
-        values[(apart > 3 * measure_rhythm(sound.time).interval) & ~exact] = np.nan
-        motor.tell("interpolated", f"{name}: interpolated to the instants of the main output")
+        values[(apart > 3 * measure_sampling(sound.time).interval) & ~exact] = np.nan
+        motor.report("interpolated", f"{name}: interpolated to the instants of the main output")
     if name == "count":
         return values
     if not np.isfinite(values).all():
         values = np.where(np.isfinite(values), values, np.nan)
         if np.isnan(values).all():
             return None
-        motor.tell("values_missing", f"{name}: {int(np.isnan(values).sum())} values missing")
+        motor.report("values_missing", f"{name}: {int(np.isnan(values).sum())} values missing")
     return values
 
 
 def _drop_single_samples(
-    motor: Motor, axis: Integers, columns: dict[str, Any], starts: Flags
+    motor: Context, axis: Integers, columns: dict[str, Any], starts: Flags
 ) -> tuple[Integers, dict[str, Any], Flags]:
     """Leave out segments of a single sample."""
     edges = np.append(np.flatnonzero(starts), axis.size)
@@ -329,6 +329,6 @@ def _drop_single_samples(
         return axis, columns, starts
     keep = np.repeat(~short, np.diff(edges))
     text = f"{int(short.sum())} single samples between gaps were left out"
-    motor.tell("single_samples", text)
+    motor.report("single_samples", text)
     kept = {name: None if v is None else v[keep] for name, v in columns.items()}
     return axis[keep], kept, starts[keep]

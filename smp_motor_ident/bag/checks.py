@@ -50,7 +50,7 @@ def find_impossible_values(value: Array, *, steps_allowed: bool) -> Flags:
     return none
 
 
-def is_of_two_publishers(count: Array) -> bool:
+def has_two_publishers(count: Array) -> bool:
     """Return whether a count jumps to and fro between two courses from sample to sample."""
     there = np.abs(np.diff(count))[:-1]
     back = np.abs(count[2:] - count[:-2])

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from smp_motor_control.arrays import Array, Integers
 from smp_motor_ident.bag.mapping import Signal
-from smp_motor_ident.bag.storage import Table, found
+from smp_motor_ident.bag.storage import Table, make_finding
 from smp_motor_ident.bag.units import UNITS
 from smp_motor_ident.errors import BagError
 from smp_motor_ident.limits import MIN_CLOCK_LEAP_S, MIN_RESTART_ROWS
@@ -21,10 +21,10 @@ Parts = list[tuple[int, int]]
 
 MISSING_TIME = -(2**62)  # time of a row without one
 
-_ROWS = round(MIN_RESTART_ROWS)
-_BEFORE = 1000  # smallest number of earlier rows examined
+_MIN_RUN_ROWS = round(MIN_RESTART_ROWS)
+_MIN_EARLIER_ROWS = 1000  # smallest number of earlier rows examined
 
-_SECOND = 1_000_000_000
+_SECOND_NS = 1_000_000_000
 BEAT_SAMPLES = 32  # samples that determine a beat
 MAX_CLOCK_OFFSET_NS = 50_000_000
 """Topics whose offsets differ by less [ns] share a clock; latency explains the difference."""
@@ -82,7 +82,7 @@ def fit_clock(stamp: Integers, log: Integers) -> ClockFit:
     base = int(np.min(log - stamp))
     late = (log - stamp - base).astype(np.float64)
     span = float(since.max())
-    if span < 10 * _SECOND or stamp.size < 200:
+    if span < 10 * _SECOND_NS or stamp.size < 200:
         return ClockFit(float(base), 0.0, origin)
     part = np.minimum((since * (20 / span)).astype(np.int8), 19)
     parts = [inside for k in range(20) if (inside := np.flatnonzero(part == k)).size]
@@ -120,7 +120,7 @@ def split_at_resets(time: Integers) -> Parts:
         return whole
     steps = np.diff(time)
     usual = float(np.median(np.abs(steps)))
-    back = np.flatnonzero(steps < -max(100 * usual, 0.5 * _SECOND)) + 1
+    back = np.flatnonzero(steps < -max(100 * usual, 0.5 * _SECOND_NS)) + 1
     if not back.size or back.size > time.size / 40:
         return whole
     edges = [0, *back.tolist(), time.size]
@@ -130,7 +130,7 @@ def split_at_resets(time: Integers) -> Parts:
 
 
 @dataclass(frozen=True)
-class Rhythm:
+class Sampling:
     """Regularity of a sampling interval."""
 
     interval: float  # median interval [ns]
@@ -162,17 +162,17 @@ class Rhythm:
         voltage leaves open when it changed within a long interval.
         """
         if self.regular or averaged:
-            return max(20 * self.interval, 0.02 * _SECOND)
-        return max(100 * self.interval, 1.0 * _SECOND)
+            return max(20 * self.interval, 0.02 * _SECOND_NS)
+        return max(100 * self.interval, 1.0 * _SECOND_NS)
 
 
-def measure_rhythm(time: Integers) -> Rhythm:
+def measure_sampling(time: Integers) -> Sampling:
     """Return the regularity of sampling."""
     if time.size < 2:
-        return Rhythm(0.0, False)
+        return Sampling(0.0, False)
     steps = np.diff(time)
     median = float(np.median(steps))
-    return Rhythm(median, bool(np.mean(np.abs(steps - median) <= 0.25 * median) >= 0.8))
+    return Sampling(median, bool(np.mean(np.abs(steps - median) <= 0.25 * median) >= 0.8))
 
 
 def average_held_input(time: Integers, value: Array, held: str, at: Integers) -> Array:
@@ -205,33 +205,33 @@ def split_into_runs(time: NDArray[Any], columns: Mapping[str, NDArray[Any]]) -> 
     the rows before.  Single rows out of order, a block that was flushed late and duplicates
     start no run; they are sorted.
     """
-    parts = _parts(time, columns)
+    parts = _split_at_restarts(time, columns)
     if len(parts) > 1 and columns:
         there = [np.isfinite(column) for column in columns.values()]
         if np.mean(np.all(there, axis=0)) < 0.5:  # rows of several kinds, written in turn
-            alone = [_parts(time[rows], {}) for rows in there]
+            alone = [_split_at_restarts(time[rows], {}) for rows in there]
             if all(len(own) == 1 for own in alone):
                 return [(0, time.size)]
     return parts
 
 
-def _parts(time: NDArray[Any], columns: Mapping[str, NDArray[Any]]) -> Parts:
+def _split_at_restarts(time: NDArray[Any], columns: Mapping[str, NDArray[Any]]) -> Parts:
     steps = np.abs(np.diff(time))
     moved = steps[steps > 0]
     if not moved.size:
         return [(0, time.size)]
     back = np.flatnonzero(np.diff(time) < -MIN_RESTART_ROWS * np.median(moved)) + 1
-    if back.size * 2 * _ROWS > time.size:  # shuffled, not restarted
+    if back.size * 2 * _MIN_RUN_ROWS > time.size:  # shuffled, not restarted
         return [(0, time.size)]
     # Not a single row that came early or late: most rows that follow are earlier than those before
     falls = [
         k
         for k in back.tolist()
-        if np.median(time[k : k + _ROWS]) < np.median(time[max(0, k - _ROWS) : k])
+        if np.median(time[k : k + _MIN_RUN_ROWS]) < np.median(time[max(0, k - _MIN_RUN_ROWS) : k])
     ]
     edges, fell = [0], 0
     for k, end in pairwise([*falls, time.size]):
-        begin = max(edges[-1], min(fell, k - _BEFORE))
+        begin = max(edges[-1], min(fell, k - _MIN_EARLIER_ROWS))
         if _overlaps(time, columns, slice(begin, k), slice(k, end)):
             edges.append(k)
         fell = k
@@ -246,7 +246,11 @@ def _overlaps(
     inside = later[(later >= earlier[0]) & (later <= earlier[-1])]
     holes = np.unique(np.searchsorted(earlier, inside, "right"))
     # A block that came late fills one hole, a few late rows one each; a last run may be short.
-    least = _ROWS if later.size > 2 * _ROWS else max(1, min(_ROWS, inside.size - 1))
+    least = (
+        _MIN_RUN_ROWS
+        if later.size > 2 * _MIN_RUN_ROWS
+        else max(1, min(_MIN_RUN_ROWS, inside.size - 1))
+    )
     if holes.size <= least:
         return False
     _, first, second = np.intersect1d(time[old], later, return_indices=True)
@@ -279,7 +283,7 @@ def remove_leaps(
     """
     every = np.sort(np.concatenate(list(times.values())))
     steps = np.diff(every.view(np.uint64))  # the farthest two have no signed distance
-    last = np.flatnonzero(steps > MIN_CLOCK_LEAP_S * _SECOND)
+    last = np.flatnonzero(steps > MIN_CLOCK_LEAP_S * _SECOND_NS)
     if not last.size:
         return dict(times), []
     leaps = steps[last]
@@ -294,11 +298,11 @@ def remove_leaps(
 def pause_between(time: Integers, parts: Parts, gap: float) -> int:
     """Return a pause [ns] that begins a new segment; ``gap`` [s] is the user's limit."""
     longest = max(parts, key=lambda part: part[1] - part[0])
-    usual = measure_rhythm(np.sort(time[slice(*longest)])).gap()
-    return 3 * round(max(usual, gap * _SECOND)) + _SECOND
+    usual = measure_sampling(np.sort(time[slice(*longest)])).gap()
+    return 3 * round(max(usual, gap * _SECOND_NS)) + _SECOND_NS
 
 
-def lay_out_runs(tables: Mapping[str, Table], gap: float, where: str) -> dict[str, Table]:
+def concatenate_runs(tables: Mapping[str, Table], gap: float, where: str) -> dict[str, Table]:
     """Return tables of one clock with their runs in sequence; BagError if the runs differ."""
     every = {topic: split_into_runs(table.logged, table.columns) for topic, table in tables.items()}
     numbers = {topic: len(parts) - 1 for topic, parts in every.items()}
@@ -315,7 +319,7 @@ def lay_out_runs(tables: Mapping[str, Table], gap: float, where: str) -> dict[st
     count = next(iter(numbers.values()))
     moved = concatenate_parts(times, list(every.values()), [pause] * count)
     text = f"{where}: the time starts again {count} times, as of runs written one below another"
-    warning = found("clock_set_back", f"{text}; a new segment each", "warning", times=count)
+    warning = make_finding("clock_set_back", f"{text}; a new segment each", "warning", times=count)
     return {
         topic: replace(table, log=time, findings=[*table.findings, warning])
         for (topic, table), time in zip(tables.items(), moved)

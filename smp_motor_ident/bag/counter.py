@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from smp_motor_control.arrays import Array, Integers
-from smp_motor_ident.bag.storage import found
+from smp_motor_ident.bag.storage import make_finding
 from smp_motor_ident.errors import BagError
 from smp_motor_ident.finding import Finding
 from smp_motor_ident.limits import (
@@ -56,8 +56,8 @@ def find_wrap(value: Array) -> Wrap | None:
         return None
     small = steps.copy()
     small[jumps] = np.nan
-    before = np.stack([_at(small, jumps - k) for k in (1, 2, 3)])
-    after = np.stack([_at(small, jumps + k) for k in (1, 2, 3)])
+    before = np.stack([_take_or_nan(small, jumps - k) for k in (1, 2, 3)])
+    after = np.stack([_take_or_nan(small, jumps + k) for k in (1, 2, 3)])
     seen = np.isfinite(before).any(axis=0) & np.isfinite(after).any(axis=0)
     jump = steps[jumps[seen]]
     if jump.size < _MIN_WRAPS:
@@ -97,7 +97,7 @@ def undo_wraps(value: Array, width: float) -> Array:
     return np.concatenate([value[:1], value[:1] + np.cumsum(whole)])
 
 
-def _at(value: Array, index: Integers) -> Array:
+def _take_or_nan(value: Array, index: Integers) -> Array:
     inside = (index >= 0) & (index < value.size)
     return np.where(inside, value[np.clip(index, 0, value.size - 1)], np.nan)
 
@@ -127,11 +127,11 @@ def unwrap(count: Integers, bits: int | None, expected: Array | None = None) -> 
         if width & (width - 1):
             text = f"the encoder starts again at {width} counts; it was unwrapped"
             whole = np.rint(undo_wraps(count.astype(np.float64), width)).astype(np.int64)
-            findings.append(found("counter_wraps", text, counts=width))
+            findings.append(make_finding("counter_wraps", text, counts=width))
             return Unwrapped(whole, np.zeros(0, np.int64), findings)
         bits = width.bit_length() - 1
         text = f"the encoder wraps at 2^{bits} counts; it was unwrapped"
-        findings.append(found("counter_wraps", text, bits=bits))
+        findings.append(make_finding("counter_wraps", text, bits=bits))
     if bits:
         near = np.rint(guess).astype(np.int64)
         shift = np.int64(64 - bits)
@@ -154,12 +154,12 @@ def unwrap(count: Integers, bits: int | None, expected: Array | None = None) -> 
 def report_resets(what: str, times: int) -> Finding:
     """Report resets of a counter or an angle."""
     text = f"the {what} was reset {times} times; a new segment each"
-    return found("counter_reset", text, "warning", times=times)
+    return make_finding("counter_reset", text, "warning", times=times)
 
 
 def _estimate_width(count: Integers, steps: Integers, guess: Array) -> int:
     """Return the count at which a counter restarts, estimated from its data; 0 if none."""
-    bits = _width(steps, guess) or _filled_width(count, steps)
+    bits = _find_width(steps, guess) or _find_filled_width(count, steps)
     wrap = find_wrap(count.astype(np.float64))
     if wrap is None or (bits and wrap.admits(2.0**bits)):
         return 2**bits if bits else 0
@@ -171,7 +171,7 @@ def _estimate_width(count: Integers, steps: Integers, guess: Array) -> int:
     return round_to_counts(wrap, int(np.ptp(count)))
 
 
-def is_full(count: Integers) -> int:
+def find_full_count(count: Integers) -> int:
     """Return the end of a range at which a counter stays, or 0."""
     for last in (int(count.max()), int(count.min())) if count.size > 1 else ():
         size = last + 1 if last > 0 else -last  # 2^k - 1 at the upper end, -2^k at the lower
@@ -187,7 +187,7 @@ def _bound_steps(steps: Integers, guess: Array) -> float:
     return 10.0 * float(np.quantile(size, 0.9)) + 100.0
 
 
-def _width(steps: Integers, guess: Array) -> int:
+def _find_width(steps: Integers, guess: Array) -> int:
     """Return the width at which a counter evidently wraps, or 0."""
     rest = steps - guess
     large = np.abs(rest) > _bound_steps(steps, guess)
@@ -201,7 +201,7 @@ def _width(steps: Integers, guess: Array) -> int:
     return 0
 
 
-def _filled_width(count: Integers, steps: Integers) -> int:
+def _find_filled_width(count: Integers, steps: Integers) -> int:
     """Return the width that a counter from zero fills with steps of more than half, or 0."""
     bits = int(count.max()).bit_length()
     filled = bits >= 7 and count.min() >= 0 and np.ptp(count) > 0.97 * 2**bits

@@ -15,7 +15,7 @@ from smp_motor_ident.limits import (
 )
 from smp_motor_ident.quality.lag import apply_lag
 
-LAGS, OWN = 6, 2
+COMMAND_LAGS, MOTION_LAGS = 6, 2
 MAX_DELAY_ROWS = 200  # largest delay of a command behind its motion that is searched [rows]
 CLEAR_RATIO = 0.9  # a residual so much smaller than at other shifts is clearly the smallest
 SIMILAR_RATIO = 3.0  # up to this ratio residuals are similar
@@ -25,7 +25,7 @@ MAX_FIT_ROWS = 5000  # rows used for a fit
 MOTION_BLOCKS = 200  # averaged stretches of a motion, which reduce a counter's noise
 
 
-def find_unexplained_share(u: Array, y: Array) -> float | None:
+def compute_unexplained_share(u: Array, y: Array) -> float | None:
     """Return the share of a motion that a voltage leaves unexplained; None if it explains nothing.
 
     Its past must predict the motion better than the motion's own past does (Granger's test, an F
@@ -33,21 +33,21 @@ def find_unexplained_share(u: Array, y: Array) -> float | None:
     """
     from scipy.special import fdtrc  # takes a while to load
 
-    if y.size < 5 * (LAGS + OWN) or not (np.std(y) > 0 and np.std(u) > 0):
+    if y.size < 5 * (COMMAND_LAGS + MOTION_LAGS) or not (np.std(y) > 0 and np.std(u) > 0):
         return None
     y, u = (y - y.mean()) / np.std(y), (u - u.mean()) / np.std(u)
-    begin = max(LAGS, OWN)
-    own = [y[begin - k : y.size - k] for k in range(1, OWN + 1)]
-    driven = [u[begin - k : u.size - k] for k in range(LAGS)]
+    begin = max(COMMAND_LAGS, MOTION_LAGS)
+    own = [y[begin - k : y.size - k] for k in range(1, MOTION_LAGS + 1)]
+    driven = [u[begin - k : u.size - k] for k in range(COMMAND_LAGS)]
     target = y[begin:]
     rests = []
     for columns in (own, own + driven):
         matrix = np.stack([*columns, np.ones(target.size)], axis=1)
         solution = np.linalg.lstsq(matrix, target, rcond=None)[0]
         rests.append(float(np.sum((target - matrix @ solution) ** 2)) + 1e-12)
-    free = target.size - OWN - LAGS - 1
-    ratio = (rests[0] - rests[1]) / LAGS / (rests[1] / free)
-    return rests[1] / rests[0] if fdtrc(LAGS, free, ratio) < EXPLANATION_LEVEL else None
+    free = target.size - MOTION_LAGS - COMMAND_LAGS - 1
+    ratio = (rests[0] - rests[1]) / COMMAND_LAGS / (rests[1] / free)
+    return rests[1] / rests[0] if fdtrc(COMMAND_LAGS, free, ratio) < EXPLANATION_LEVEL else None
 
 
 def responds_in_its_row(u: Array, y: Array) -> bool:
@@ -60,7 +60,7 @@ def responds_in_its_row(u: Array, y: Array) -> bool:
     steps, jumps = np.diff(u), np.diff(y, 2)
     held = (steps[1:-1] != 0) & (steps[:-2] == 0)  # a new command behind one that was held
     new = np.flatnonzero(held & np.isfinite(jumps[:-1] + jumps[1:]))
-    if new.size < LAGS:
+    if new.size < COMMAND_LAGS:
         return False
     size = steps[new + 1]
     at_once, later = float(size @ jumps[new]), float(size @ jumps[new + 1])
@@ -68,17 +68,17 @@ def responds_in_its_row(u: Array, y: Array) -> bool:
     return at_once > max(-NormalDist().inv_cdf(EXPLANATION_LEVEL) * scatter, later)
 
 
-def find_following_share(u: Array, y: Array) -> tuple[float, bool]:
+def compute_following_share(u: Array, y: Array) -> tuple[float, bool]:
     """Return the share of a signal that follows another with a lag, and whether it is an integral.
 
     The signal or its increments must be mostly a first-order lag of the other, and fit that better
     than the other without lag: a simultaneous signal (speed and angle, an error) drives nothing.
     """
-    if np.count_nonzero(np.diff(u)) < LAGS or _is_clock(u) or _is_clock(y):
+    if np.count_nonzero(np.diff(u)) < COMMAND_LAGS or _is_clock(u) or _is_clock(y):
         return 0.0, False
     steps = np.diff(y, prepend=y[:1])
-    itself = find_lagged_share(u, y) if _explained_share(u, steps) < MIN_EXPLAINED_SHARE else 0.0
-    return max((itself, False), (find_lagged_share(u, steps), True))
+    itself = compute_lagged_share(u, y) if _explained_share(u, steps) < MIN_EXPLAINED_SHARE else 0.0
+    return max((itself, False), (compute_lagged_share(u, steps), True))
 
 
 def find_late_rows(u: Array, y: Array) -> int:
@@ -148,7 +148,7 @@ def _residual_share(u: Array, y: Array, shift: int, lag: float) -> float:
     return best / float(np.sum((some - some.mean()) ** 2))
 
 
-def find_lagged_share(u: Array, y: Array) -> float:
+def compute_lagged_share(u: Array, y: Array) -> float:
     """Return the share of a signal explained by a lag of another; 0 if another shift is better."""
     lags = np.geomspace(1.0, max(y.size / 20, 2.0), 8)
     share = max(_explained_share(apply_lag(u - u[0], float(lag)), y) for lag in lags)

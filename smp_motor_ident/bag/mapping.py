@@ -34,7 +34,7 @@ _SCALES = ("wheel_radius", "pwm_full_scale", "pole_pairs")
 DEFAULT_MOTOR = "motor"  # name of the motor where a mapping has only one and does not name it
 _NUMBER = r"(?:\d+\.?\d*(?:[eE][+-]?\d+)?|\.\d+(?:[eE][+-]?\d+)?)"
 _PRODUCT = rf"{_NUMBER}(?:\s*[*/]\s*{_NUMBER})*"
-_SPEC = re.compile(
+_SIGNAL_FORM = re.compile(
     rf"""(?P<source>"(?:[^"]|"")*"|.+?)
     (?P<scale>(?:\s*[*/]\s*-?{_NUMBER})*)
     (?P<offset>(?:\s*[+-]\s*{_PRODUCT})?)
@@ -42,9 +42,9 @@ _SPEC = re.compile(
     (?:\s*@\s*(?P<shaft>\w+))?\s*""",
     re.VERBOSE,
 )
-_BETWEEN = re.compile(r"""\s+(?=[\w./]+=[^=])(?=(?:[^"]*"[^"]*")*[^"]*$)""")
+_ITEM_SEPARATOR = re.compile(r"""\s+(?=[\w./]+=[^=])(?=(?:[^"]*"[^"]*")*[^"]*$)""")
 """Blanks before another ``KEY=``, except in quotes."""
-_TOPIC = re.compile(r"(?P<topic>/[\w/-]+)\.(?P<field>.+)")
+_TOPIC_FIELD = re.compile(r"(?P<topic>/[\w/-]+)\.(?P<field>.+)")
 
 
 @dataclass(frozen=True)
@@ -106,7 +106,7 @@ def parse_mapping(items: Iterable[str], msg_files: Iterable[str] = ()) -> Signal
         items = [items]
     document: dict[str, Any] = {}
     motors: dict[str, dict[str, Any]] = {}
-    parts = (part for whole in items for part in _BETWEEN.split(whole.strip()))
+    parts = (part for whole in items for part in _ITEM_SEPARATOR.split(whole.strip()))
     for item in filter(None, parts):
         key, equals, value = item.partition("=")
         if not equals or not value.strip():
@@ -148,13 +148,13 @@ def from_document(document: Any, where: str = "mapping") -> SignalMap:
         if motors:
             raise BagError(f"{where}: {signals[0]} needs its wheel: WHEEL.{signals[0]}=...")
         motors = {DEFAULT_MOTOR: {n: rest.pop(n) for n in (*signals, "time") if n in rest}}
-    defaults = _motor(rest, where)
+    defaults = _read_motor(rest, where)
     for wheel in map(str, motors):
         if not is_ros_name(wheel):
             raise BagError(
                 f"{where}: {wheel!r} is not a ROS name; use letters, digits and _ as left_1"
             )
-    each = {str(w): _motor(entry, f"{where}: {w}", defaults) for w, entry in motors.items()}
+    each = {str(w): _read_motor(entry, f"{where}: {w}", defaults) for w, entry in motors.items()}
     return SignalMap(each, defaults, tuple(types))
 
 
@@ -173,7 +173,7 @@ def read_mapping(mapping: Any) -> SignalMap:
     return parse_mapping(mapping)
 
 
-def _motor(entry: Any, where: str, defaults: MotorMap | None = None) -> MotorMap:
+def _read_motor(entry: Any, where: str, defaults: MotorMap | None = None) -> MotorMap:
     """Return one motor's part, validated, with the common settings as defaults."""
     if not isinstance(entry, Mapping):
         raise BagError(f"{where}: must hold keys and values")
@@ -183,13 +183,13 @@ def _motor(entry: Any, where: str, defaults: MotorMap | None = None) -> MotorMap
     for key, value in entry.items():
         place = f"{where}: {key}"
         if key in SIGNALS:
-            signals[key] = _signal(key, value, place)
+            signals[key] = _read_signal(key, value, place)
         elif key in HARDWARE:
-            hardware[key] = _positive(value, place, zero=key in ("encoder_bits", *ACCURACIES))
+            hardware[key] = _read_positive(value, place, zero=key in ("encoder_bits", *ACCURACIES))
         elif key in (*_SECONDS, *_SCALES):
-            options[key] = _positive(value, place, zero=key in _SECONDS)
+            options[key] = _read_positive(value, place, zero=key in _SECONDS)
         elif key in _CHOICES:
-            options[key] = _choice(key, value, place)
+            options[key] = _check_choice(key, value, place)
         else:
             known = ", ".join((*SIGNALS, *HARDWARE, *_CHOICES, *_SECONDS, *_SCALES))
             raise BagError(f"{place} is not a key of a mapping; use {known}")
@@ -198,20 +198,20 @@ def _motor(entry: Any, where: str, defaults: MotorMap | None = None) -> MotorMap
     return replace(motor, signals=signals, hardware=hardware, **options)
 
 
-def _choice(key: str, value: Any, place: str) -> str:
+def _check_choice(key: str, value: Any, place: str) -> str:
     if value not in _CHOICES[key]:
         raise BagError(f"{place} is {value!r}; use {' or '.join(_CHOICES[key])}")
     return str(value)
 
 
-def _positive(value: Any, place: str, *, zero: bool) -> float:
-    number = _number(value, place)
+def _read_positive(value: Any, place: str, *, zero: bool) -> float:
+    number = _read_number(value, place)
     if number < 0 or (number == 0 and not zero) or not math.isfinite(number):
         raise BagError(f"{place} is {value}; it must be a {'' if zero else 'positive '}number")
     return number
 
 
-def _number(value: Any, place: str) -> float:
+def _read_number(value: Any, place: str) -> float:
     """Return a number, given as such or as a product such as ``12/255``."""
     if isinstance(value, (int, float)) and not isinstance(value, bool):
         return float(value)
@@ -220,10 +220,10 @@ def _number(value: Any, place: str) -> float:
     text = text.lstrip("+-").strip()
     if not re.fullmatch(_PRODUCT, text):
         raise BagError(f"{place} is {value!r}; it must be a number or a product such as 12/255")
-    return _times(sign, text, f"{place}: {value!r}")
+    return _multiply(sign, text, f"{place}: {value!r}")
 
 
-def _times(result: float, factors: str, place: str) -> float:
+def _multiply(result: float, factors: str, place: str) -> float:
     """Multiply by a product such as ``12/255`` or ``*12/255``."""
     for operator, factor in re.findall(rf"([*/]?)\s*(-?{_NUMBER})", factors):
         if operator == "/" and float(factor) == 0:
@@ -232,7 +232,7 @@ def _times(result: float, factors: str, place: str) -> float:
     return result
 
 
-def _signal(name: str, value: Any, place: str) -> Signal:
+def _read_signal(name: str, value: Any, place: str) -> Signal:
     if isinstance(value, Mapping):
         unknown = set(value) - {"topic", "field", "column", "scale", "offset", "unit", "shaft"}
         if unknown:
@@ -241,16 +241,16 @@ def _signal(name: str, value: Any, place: str) -> Signal:
         if not isinstance(source, str):
             raise BagError(f"{place}: needs topic and field, or a column")
         topic, unit, shaft = (str(value.get(key, "")) for key in ("topic", "unit", "shaft"))
-        scale = _number(value.get("scale", 1.0), f"{place}: scale")
-        offset = _number(value.get("offset", 0.0), f"{place}: offset")
+        scale = _read_number(value.get("scale", 1.0), f"{place}: scale")
+        offset = _read_number(value.get("offset", 0.0), f"{place}: offset")
         signal = Signal(topic, source, scale, offset, unit, shaft)
     else:
-        signal = _written(str(value), place)
+        signal = _parse_signal(str(value), place)
     constant = name == "voltage" and signal.offset != 0  # a constant level
     if not (signal.scale or constant) or not math.isfinite(signal.scale):
         raise BagError(f"{place}: its scale is {signal.scale}; it must be finite and not 0")
     if signal.shaft:
-        _choice("shaft", signal.shaft, place)
+        _check_choice("shaft", signal.shaft, place)
     if signal.topic:
         parse_path(signal.field)
     try:
@@ -259,15 +259,15 @@ def _signal(name: str, value: Any, place: str) -> Signal:
         raise BagError(f"{place}: {error}") from None
 
 
-def _written(text: str, place: str) -> Signal:
+def _parse_signal(text: str, place: str) -> Signal:
     """Read ``SOURCE[*SCALE][+OFFSET][:UNIT][@SHAFT]``."""
-    match = _SPEC.fullmatch(text)
+    match = _SIGNAL_FORM.fullmatch(text)
     if match is None:
         raise BagError(f"{place}: {text!r} is not SOURCE[*SCALE][+OFFSET][:UNIT][@SHAFT]")
     source = match["source"].strip()
-    scale = _times(1.0, match["scale"], f"{place}: {text!r}")
-    offset = _number(match["offset"].replace(" ", "") or "0", place)
-    named = _TOPIC.fullmatch(source)  # anything else is a column, or in quotes
+    scale = _multiply(1.0, match["scale"], f"{place}: {text!r}")
+    offset = _read_number(match["offset"].replace(" ", "") or "0", place)
+    named = _TOPIC_FIELD.fullmatch(source)  # anything else is a column, or in quotes
     path = source[1:-1].replace('""', '"') if source.startswith('"') else source
     topic, path = (named["topic"], named["field"].strip()) if named else ("", path)
     return Signal(topic, path, scale, offset, match["unit"] or "", match["shaft"] or "")

@@ -11,7 +11,7 @@ WORDS_OF_VOLTS = (
     r"|gerilim|feszülts|напряж|电压|電圧|전압"
 )
 WORDS_OF_RADIANS = r"rad|omega|ω|(?:^|\W|_)w(?:$|\W|_)"
-ROLES = {
+ROLE_PATTERNS = {
     # Patterns of field and topic names, the most specific first.
     "direction": r"(?:^|\W|_)dir(?:ection)?(?:$|\W|_)|richtung|sentido|direcci",
     "voltage": WORDS_OF_VOLTS + r"|pwm|duty|throttle|entrada|eingang|^in$|(?:^|\W|_)power(?:$|\W|_)"
@@ -26,25 +26,25 @@ ROLES = {
     r"|(?:^|\W|_)(?:pos|pot|pote)(?:$|\W|_|nt|nci)",
 }
 MOTIONS = ("velocity", "position", "count")
-NO_VOLTAGE = r"twist|cmd_vel|linear|angular|batter|supply|vbat"
-TORQUE = r"effort"
+NOT_VOLTAGE = r"twist|cmd_vel|linear|angular|batter|supply|vbat"
+TORQUE_NAMES = r"effort"
 """A torque [N m] in ``sensor_msgs/JointState``; some drivers put their command there."""
-ELSEWHERE = (
+POSE_NAMES = (
     r"pose(?:$|\W|_|[A-Z])|orientation|quaternion|(?:^|\W|_)(?:linear|angular)(?:$|\W|_)|translation"
     r"|transform|accel|gyro|magnet|(?:^|\W|_)(?:odom|gps|imu|point)(?:$|\W|_)"
 )
 """Names of the robot's pose, which belong to no motor."""
-DRIVES = WORDS_OF_VOLTS + r"|pwm|duty|throttle"
+VOLTAGE_NAMES = WORDS_OF_VOLTS + r"|pwm|duty|throttle"
 SPEED_COMMAND = (
     r"twist|cmd_vel|vel_cmd|(?:speed|velocity|rpm)_(?:cmd|command|setpoint|set_point|target|ref)"
     r"|(?:cmd|command|setpoint|target|desired|ref)(?:_wheel)?_(?:speed|vel|velocity|rpm)"
 )
-MAY_BE_SUPPLY = r"(?:^|\W|_)v_?in(?:$|\W|_)"
-NO_MOTION = (
+SUPPLY_NAMES = r"(?:^|\W|_)v_?in(?:$|\W|_)"
+NOT_MOTION = (
     r"set_?point|target|desired|autospeed|refer[eê]n[ct]|soll|cmd|command|consign|[\W_]m?v$"
     r"|(?:^|\W|_)(?:erro?r?e?|erreur|fehler|hata|uchyb|ошибка)(?:$|\W|_)"
 )
-HINTS = {
+UNIT_HINTS = {
     # Units that names hint at, as a mapping writes them
     "velocity": ((r"rpm|drehzahl", ":rpm"), (r"deg", ":deg/s")),
     "position": ((r"deg", ":deg"),),
@@ -70,7 +70,7 @@ def separates_motors(column: str, words: Sequence[str] = ()) -> bool:
 
     A column called ``wheel`` alone does if its words are sides, letters or numbered.
     """
-    sided = (wheel_of(word) or re.fullmatch(r".*\d|[A-Za-z]", word) for word in words)
+    sided = (find_side(word) or re.fullmatch(r".*\d|[A-Za-z]", word) for word in words)
     named = bool(words and _NAMED.fullmatch(column.strip())) and all(sided)
     return named or _NUMBERED.fullmatch(column.strip()) is not None
 
@@ -80,11 +80,13 @@ def split_words(name: str) -> str:
     return re.sub(r"(?<=[a-z\d])(?=[A-Z])|(?<=[A-Za-z])(?=\d+$)", "_", name)
 
 
-def role_of(topic: str, path: str) -> str:
+def find_role(topic: str, path: str) -> str:
     """Return a field's role by its own name, else by its parent's, else by its topic's."""
     for text in (*reversed(re.sub(r"\[[^\]]*\]", "", path).split(".")), topic):
-        said = [r for r, pattern in ROLES.items() if re.search(pattern, split_words(text), re.I)]
-        if said[:1] == ["voltage"] and "velocity" in said and not drives_by_name(text):
+        said = [
+            r for r, pattern in ROLE_PATTERNS.items() if re.search(pattern, split_words(text), re.I)
+        ]
+        if said[:1] == ["voltage"] and "velocity" in said and not names_voltage(text):
             return ""  # a speed command
         if said:
             return said[0]
@@ -105,39 +107,39 @@ def find_pose_fields(paths: Sequence[str]) -> set[str]:
 def is_speed_command(name: str) -> bool:
     """Return whether type and name denote a speed command instead of a voltage."""
     speed = re.search(SPEED_COMMAND, split_words(name), re.IGNORECASE) is not None
-    return speed and not drives_by_name(name)
+    return speed and not names_voltage(name)
 
 
-def drives_by_name(text: str) -> bool:
+def names_voltage(text: str) -> bool:
     """Return whether a name denotes a voltage or duty cycle rather than any command."""
-    return re.search(DRIVES, text, re.IGNORECASE) is not None
+    return re.search(VOLTAGE_NAMES, text, re.IGNORECASE) is not None
 
 
-def wheel_of(source: str) -> str:
+def find_side(source: str) -> str:
     """Return the side of the robot in a name."""
     words = re.split(r"[^a-z]+", split_words(source).lower())
     return "_".join(side for side in _SIDES if side in words)
 
 
-def motor_of(name: str) -> str:
+def find_motor(name: str) -> str:
     """Return the motor whose letter or digit a signal's name ends in: ``velL``, ``pwm_2``."""
     match = _LETTER.fullmatch(name)
-    if match is None or not role_of("", match[1]):
+    if match is None or not find_role("", match[1]):
         return ""
     letter = match[2].lower()
     return _LETTERS.get(letter, f"motor_{letter}")
 
 
-def parent_of(path: str) -> str:
+def find_parent(path: str) -> str:
     """Return the first name of a field's path where it is a ROS name; else nothing."""
     whole, dot, _ = path.partition(".")
     return whole if dot and is_ros_name(whole) else ""
 
 
-def is_barred(role: str, text: str) -> bool:
+def is_excluded(role: str, text: str) -> bool:
     """Return whether a type, topic or name rules out a role."""
     if role in ("current", "direction"):
         return False
-    if re.search(ELSEWHERE, text, re.IGNORECASE):
+    if re.search(POSE_NAMES, text, re.IGNORECASE):
         return True
-    return re.search(NO_VOLTAGE if role == "voltage" else NO_MOTION, text, re.I) is not None
+    return re.search(NOT_VOLTAGE if role == "voltage" else NOT_MOTION, text, re.I) is not None

@@ -26,7 +26,7 @@ from smp_motor_ident.bag.tables import (
 )
 from smp_motor_ident.bag.topics import Listing, Proposal, TopicInfo, describe_topics
 from smp_motor_ident.bag.types import Types
-from smp_motor_ident.bag.units import needs, unit_of
+from smp_motor_ident.bag.units import find_unit, needs
 from smp_motor_ident.errors import BagError
 
 _RADIUS = "in metres, because the recording has the speed of the rim"
@@ -66,9 +66,9 @@ class _Candidate:
     def unit(self) -> str:
         """Unit that follows the source, by name; never a scale."""
         text = f"{self.info.topic}.{self.path}"
-        if unit := unit_of(self.role, self.info.units.get(self.path, ""), text):
+        if unit := find_unit(self.role, self.info.units.get(self.path, ""), text):
             return f":{unit}"
-        likely = names.HINTS.get(self.role, ())
+        likely = names.UNIT_HINTS.get(self.role, ())
         hint = next((unit for pattern, unit in likely if re.search(pattern, text, re.I)), "")
         whole = self.value[np.isfinite(self.value)]
         if self.role == "voltage" and not hint and whole.size:
@@ -87,7 +87,7 @@ def list_topics(paths: Any, msg_files: Iterable[str] = ()) -> list[Listing]:
     types = Types(msg_files)
     listings = []
     for recording in find_recordings(paths):
-        with read.one_line(recording):
+        with read.errors_in_one_line(recording):
             topics = describe_topics(recording, types)
             needed = all(info.type != read.STATE for info in topics)
             proposal = propose(recording, topics, types) if needed else Proposal()
@@ -96,7 +96,7 @@ def list_topics(paths: Any, msg_files: Iterable[str] = ()) -> list[Listing]:
                     read.read_recording(recording, _fill_placeholders(proposal), types)
                 except BagError as error:
                     text = f"a mapping was proposed by names and cannot be read: {error}"
-                    recording.findings.append(storage.found("proposal_failed", text))
+                    recording.findings.append(storage.make_finding("proposal_failed", text))
                     proposal = Proposal(remark="no mapping is suggested that can be read")
         listings.append(Listing(
             name=recording.name, topics=topics, needs_mapping=needed,
@@ -107,7 +107,7 @@ def list_topics(paths: Any, msg_files: Iterable[str] = ()) -> list[Listing]:
 
 def propose(recording: Recording, topics: list[TopicInfo], types: Types) -> Proposal:
     """Return the file's own mapping, or one by names that the data confirm where they can."""
-    if own := _from_file(recording):
+    if own := _read_own_mapping(recording):
         return own
     apart = [[info] for info in topics] if any(o.table and o.count for o in topics) else [topics]
     proposals = [_by_names_and_data(recording, group, types) for group in apart]
@@ -116,15 +116,15 @@ def propose(recording: Recording, topics: list[TopicInfo], types: Types) -> Prop
 
 def _by_names_and_data(recording: Recording, topics: list[TopicInfo], types: Types) -> Proposal:
     """Return a mapping by names and data for each group of fields."""
-    time = _time(topics)
-    fields = list(_candidates(recording, topics, types, time))
+    time = _find_time_column(topics)
+    fields = list(_collect_candidates(recording, topics, types, time))
     every = [c for c in fields if c.value.size]
     alone = recording.is_table and len(topics) == 1
     unnamed = [c for c in every if not c.role]
     if alone and time is None and (k := drives.find_clock([c.value for c in unnamed])) is not None:
         time = replace(unnamed[k], role="time")
-    chosen, remarks = _by_names(every)
-    if alone and not chosen and (pair := _by_data([c for c in every if c is not time])):
+    chosen, remarks = _select_by_names(every)
+    if alone and not chosen and (pair := _select_by_data([c for c in every if c is not time])):
         chosen = [("", pair)]
         remarks = [f"by the data alone: {pair[1].source} follows {pair[0].source}; see to both"]
     if not chosen:
@@ -141,10 +141,12 @@ def _by_names_and_data(recording: Recording, topics: list[TopicInfo], types: Typ
     return Proposal(suggestion=items, asked=added, remark="; ".join(remarks))
 
 
-def _by_names(every: Sequence[_Candidate]) -> tuple[list[tuple[str, list[_Candidate]]], list[str]]:
+def _select_by_names(
+    every: Sequence[_Candidate],
+) -> tuple[list[tuple[str, list[_Candidate]]], list[str]]:
     """Return voltages and motions by wheel according to their names, and unconfirmed ones."""
     wheels: dict[tuple[str, str], list[_Candidate]] = {}
-    for candidate in _by_motor(_by_robot(every)):
+    for candidate in _assign_motors(_assign_robots(every)):
         wheels.setdefault((candidate.robot, candidate.wheel), []).append(candidate)
     found_by_wheel, remarks = [], []
     for (robot, wheel), fields in sorted(wheels.items()):
@@ -175,33 +177,33 @@ def _by_names(every: Sequence[_Candidate]) -> tuple[list[tuple[str, list[_Candid
     return found_by_wheel, remarks
 
 
-def _by_robot(every: Sequence[_Candidate]) -> list[_Candidate]:
+def _assign_robots(every: Sequence[_Candidate]) -> list[_Candidate]:
     """Return fields with the namespace that tells robots, or motors, apart: ``/robot1/pwm``."""
     spaces: dict[tuple[str, str], set[str]] = {}
     for c in every:
-        space, rest = _namespace(c)
+        space, rest = _split_namespace(c)
         spaces.setdefault((rest, c.path), set()).add(space)
     apart = {space for several in spaces.values() if len(several) > 1 for space in several}
-    robots = [space for space in apart if is_ros_name(space) and not names.wheel_of(space)]
-    return [replace(c, robot=s) if (s := _namespace(c)[0]) in robots else c for c in every]
+    robots = [space for space in apart if is_ros_name(space) and not names.find_side(space)]
+    return [replace(c, robot=s) if (s := _split_namespace(c)[0]) in robots else c for c in every]
 
 
-def _namespace(candidate: _Candidate) -> tuple[str, str]:
+def _split_namespace(candidate: _Candidate) -> tuple[str, str]:
     """Return a topic's first name and its others; no first where it has one only."""
     parts = candidate.info.topic.split("/", 2)
     return (parts[1], parts[2]) if len(parts) == 3 and not parts[0] else ("", parts[-1])
 
 
 def _is_torque(candidate: _Candidate) -> bool:
-    return re.search(names.TORQUE, candidate.path, re.IGNORECASE) is not None
+    return re.search(names.TORQUE_NAMES, candidate.path, re.IGNORECASE) is not None
 
 
-def _by_motor(every: Sequence[_Candidate]) -> list[_Candidate]:
+def _assign_motors(every: Sequence[_Candidate]) -> list[_Candidate]:
     """Return fields with the motor or the run that their names tell apart.
 
     A name's ending identifies the motor (``velL``), a field's parent the run (``run_2.u``).
     """
-    for tell in (names.motor_of, names.parent_of):
+    for tell in (names.find_motor, names.find_parent):
         named = [c if c.wheel else replace(c, wheel=tell(c.path)) for c in every]
         driven = {c.wheel for c in named if c.role == "voltage"}
         moved = {c.wheel for c in named if c.role in names.MOTIONS and c.wheel}
@@ -217,7 +219,7 @@ def _add_direction(voltage: _Candidate, way: _Candidate) -> _Candidate:
     return replace(voltage, value=checks.apply_direction(size, direction, way.source).value)
 
 
-def _by_data(every: list[_Candidate]) -> list[_Candidate]:
+def _select_by_data(every: list[_Candidate]) -> list[_Candidate]:
     """Return a voltage and the motion that follows it best, if names do not identify both."""
     size = max((c.value.size for c in every), default=0)
     fields = [c for c in every if c.value.size == size][:_MAX_UNNAMED_COLUMNS]
@@ -227,9 +229,9 @@ def _by_data(every: list[_Candidate]) -> list[_Candidate]:
     best, pair = 0.0, []
     for u, y in product(voltages, motions) if unnamed else ():
         drive, moved = u.value[:_MAX_SAMPLES], y.value[:_MAX_SAMPLES]
-        share, summed = (0.0, False) if u is y else drives.find_following_share(drive, moved)
+        share, summed = (0.0, False) if u is y else drives.compute_following_share(drive, moved)
         steps = np.diff(moved, prepend=moved[:1]) if summed else moved
-        if share > best and drives.find_unexplained_share(drive, steps) is not None:
+        if share > best and drives.compute_unexplained_share(drive, steps) is not None:
             way = "count" if np.array_equal(y.value, np.rint(y.value)) else "position"
             way = y.role or (way if summed else "velocity")
             best, pair = share, [replace(u, role="voltage"), replace(y, role=way)]
@@ -273,7 +275,7 @@ def _required_keys(
     return asked
 
 
-def _from_file(recording: Recording) -> Proposal | None:
+def _read_own_mapping(recording: Recording) -> Proposal | None:
     """Return the mapping of a table whose columns have the names and units of signals."""
     if not recording.is_table:
         return None
@@ -296,7 +298,7 @@ def _from_file(recording: Recording) -> Proposal | None:
 
 def _select_untestable(voltages: list[_Candidate], motions: list[_Candidate]) -> list[_Candidate]:
     """Return a voltage that changes less often than a test needs, and a motion, by their names."""
-    seldom = [c for c in voltages if np.count_nonzero(np.diff(c.value)) < drives.LAGS]
+    seldom = [c for c in voltages if np.count_nonzero(np.diff(c.value)) < drives.COMMAND_LAGS]
     moving = [
         c for role in names.MOTIONS for c in motions if c.role == role and np.ptp(c.value) > 0
     ]
@@ -333,7 +335,7 @@ def _fill_placeholders(proposal: Proposal) -> mapping.SignalMap:
     return replace(given, motors=motors)
 
 
-def _time(topics: list[TopicInfo]) -> _Candidate | None:
+def _find_time_column(topics: list[TopicInfo]) -> _Candidate | None:
     """Return the column of time of a table."""
     for info in topics:
         for path in info.fields if info.table else []:
@@ -343,7 +345,7 @@ def _time(topics: list[TopicInfo]) -> _Candidate | None:
     return None
 
 
-def _candidates(
+def _collect_candidates(
     recording: Recording, topics: list[TopicInfo], types: Types, time: _Candidate | None
 ) -> Iterator[_Candidate]:
     """Yield the fields with a role by name, and the others of a table."""
@@ -353,8 +355,8 @@ def _candidates(
         for path in info.fields:
             if (time and path == time.path) or is_time_of_part(path) or path in place:
                 continue
-            role = names.role_of(info.topic, path)
-            barred = names.is_barred(role, f"{info.type} {info.topic} {path}")
+            role = names.find_role(info.topic, path)
+            barred = names.is_excluded(role, f"{info.type} {info.topic} {path}")
             if (role or info.table) and not barred:
                 named.append((role, info, path))
     wanted: dict[str, list[str]] = {}
@@ -376,7 +378,7 @@ def _candidates(
         at = np.arange(value.size) if clock is None else clock
         there = table.present.get(path)
         kept = np.isfinite(value) & (True if there is None else there)
-        wheel = names.wheel_of(f"{info.topic}.{path}")
+        wheel = names.find_side(f"{info.topic}.{path}")
         value, times = value[kept], at.astype(np.float64)[kept]
         whole = np.array_equal(value, np.rint(value))
         role = "position" if role == "count" and not whole else role
@@ -393,7 +395,7 @@ def _find_wrap(angle: Array) -> float:
 def _is_supply(name: str, value: Array) -> bool:
     """Return whether a voltage is a supply by its name and never falls to half its maximum."""
     size = np.abs(value)
-    named = re.search(names.MAY_BE_SUPPLY, names.split_words(name), re.IGNORECASE)
+    named = re.search(names.SUPPLY_NAMES, names.split_words(name), re.IGNORECASE)
     return bool(named and size.size and 0 < size.max() < 2 * size.min())
 
 
@@ -415,7 +417,7 @@ def _select_voltage(voltages: list[_Candidate], motions: list[_Candidate]) -> li
         if not explained:
             continue
         rest = min(rest for _, rest in explained)
-        handicap = 1 if names.drives_by_name(voltage.source) else 2
+        handicap = 1 if names.names_voltage(voltage.source) else 2
         if handicap * rest * (1 + 1 / voltage.value.size) < least:
             least = handicap * rest
             first = {c.role: c for c, left in reversed(explained) if left < 2 * rest}
@@ -435,9 +437,9 @@ def _unexplained_share(voltage: _Candidate, motion: _Candidate) -> float | None:
     if motion.role != "velocity":
         turn = _find_wrap(y) if motion.role == "position" else 0.0
         steps = np.diff(np.unwrap(y, period=turn) if turn else y, prepend=y[:1])
-        if drives.find_lagged_share(u, y) > drives.find_lagged_share(
+        if drives.compute_lagged_share(u, y) > drives.compute_lagged_share(
             u, steps
         ):  # counts of an interval are a speed
             return None
         y = steps
-    return drives.find_unexplained_share(u, y)
+    return drives.compute_unexplained_share(u, y)

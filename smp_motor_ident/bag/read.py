@@ -17,7 +17,7 @@ from smp_motor_ident.bag.decode import collect
 from smp_motor_ident.bag.mapping import MotorMap, Signal, SignalMap
 from smp_motor_ident.bag.names import is_speed_command
 from smp_motor_ident.bag.source import Recording, find_recordings
-from smp_motor_ident.bag.storage import Channel, Table, found
+from smp_motor_ident.bag.storage import Channel, Table, make_finding
 from smp_motor_ident.bag.tables import (
     add_time_columns,
     add_times,
@@ -33,7 +33,7 @@ from smp_motor_ident.record import Hardware, Record
 STATE, DESCRIPTION = "smp_interfaces/msg/MotorState", "smp_interfaces/msg/MotorDescription"
 OWN_FIELDS = {name: name for name in ("voltage", "current", "velocity", "position")}
 OWN_FIELDS["count"] = "encoder_count"
-BETWEEN = 1.0  # time [s] that a joined record leaves between two recordings
+PAUSE_BETWEEN_RECORDINGS_S = 1.0  # time [s] that a joined record leaves between two recordings
 
 
 def read_experiments(paths: Any, mapping: Any = None) -> dict[str, list[Record]]:
@@ -58,7 +58,9 @@ def read_experiments(paths: Any, mapping: Any = None) -> dict[str, list[Record]]
     if failures and not read:
         raise failures[0]
     if failures:
-        missing = tuple(found("not_read", f"not read: {error}", "warning") for error in failures)
+        missing = tuple(
+            make_finding("not_read", f"not read: {error}", "warning") for error in failures
+        )
         read = {
             wheel: [replace(record, findings=(*record.findings, *missing)) for record in records]
             for wheel, records in read.items()
@@ -106,7 +108,7 @@ def join_records(records: list[Record]) -> Record:
                     f"{first.wheel}: {name} is {here} in {first.source} and {there} in "
                     f"{other.source}; identify them apart"
                 )
-    offsets = np.cumsum([0.0, *(r.duration + BETWEEN for r in records)])[:-1]
+    offsets = np.cumsum([0.0, *(r.duration + PAUSE_BETWEEN_RECORDINGS_S for r in records)])[:-1]
     lengths = np.cumsum([0, *(len(r) for r in records)])[:-1].tolist()
     findings = [replace(f, message=f"{r.source}: {f.message}") for r in records for f in r.findings]
     columns: dict[str, Any] = dict.fromkeys(OWN_FIELDS)
@@ -117,7 +119,7 @@ def join_records(records: list[Record]) -> Record:
         if any(part is None for part in parts):
             if name == "count":
                 text = "count: not in all recordings, left out"
-                findings.append(found("count_left_out", text, "warning"))
+                findings.append(make_finding("count_left_out", text, "warning"))
                 continue
             parts = [np.full(len(r), np.nan) if p is None else p for r, p in zip(records, parts)]
         columns[name] = np.concatenate(parts)
@@ -133,12 +135,12 @@ def join_records(records: list[Record]) -> Record:
 
 def read_recording(recording: Recording, asked: SignalMap, types: Types) -> list[Record]:
     """Return a recording's records."""
-    with one_line(recording):
-        return _records(recording, asked, types)
+    with errors_in_one_line(recording):
+        return _assemble_records(recording, asked, types)
 
 
 @contextmanager
-def one_line(recording: Recording) -> Iterator[None]:
+def errors_in_one_line(recording: Recording) -> Iterator[None]:
     """Turn any error into a one-line `BagError` that includes earlier findings."""
     try:
         with np.errstate(all="ignore"):  # damaged numbers may have any size
@@ -163,10 +165,10 @@ _DAMAGE = (
 """Errors that damaged bytes cause in readers; the message names the file, not the code."""
 
 
-def _records(recording: Recording, asked: SignalMap, types: Types) -> list[Record]:
+def _assemble_records(recording: Recording, asked: SignalMap, types: Types) -> list[Record]:
     """Return the records of a bag or of tables."""
     channels = recording.channels()
-    plans = _plans(recording, asked, channels)
+    plans = _plan_wheels(recording, asked, channels)
     wanted: dict[str, list[str]] = {}
     signals = [signal for plan in plans.values() for signal in plan.signals.values()]
     for topic, name in dict.fromkeys((signal.topic, signal.field) for signal in signals):
@@ -180,12 +182,12 @@ def _records(recording: Recording, asked: SignalMap, types: Types) -> list[Recor
     failures: list[BagError] = []
     for wheel in list(plans):
         plan = plans.pop(wheel)
-        description, findings = _description(wheel, plan, descriptions, tables)
+        description, findings = _find_description(wheel, plan, descriptions, tables)
         plan = replace(plan, hardware={**description, **plan.hardware})
         try:
             for name, mine in separate_motors(recording, wheel, plan, tables):
                 mine = add_times(recording, plan, mine) if recording.is_table else mine
-                record = assemble(name, plan, hardware_of(plan.hardware), mine, recording.name)
+                record = assemble(name, plan, make_hardware(plan.hardware), mine, recording.name)
                 doubts = _question_voltage(plan, channels)
                 records.append(replace(record, findings=(*findings, *doubts, *record.findings)))
         except BagError as error:
@@ -197,12 +199,14 @@ def _records(recording: Recording, asked: SignalMap, types: Types) -> list[Recor
             del tables[topic]  # its memory is needed for the next
     if failures and not records:
         raise failures[0]
-    missing = [found("not_read", f"not read: {error}", "warning") for error in failures]
+    missing = [make_finding("not_read", f"not read: {error}", "warning") for error in failures]
     shared = (*recording.findings, *missing)
     return [replace(record, findings=(*shared, *record.findings)) for record in records]
 
 
-def _plans(recording: Recording, asked: SignalMap, channels: list[Channel]) -> dict[str, MotorMap]:
+def _plan_wheels(
+    recording: Recording, asked: SignalMap, channels: list[Channel]
+) -> dict[str, MotorMap]:
     """Return the signals of every wheel, mapped by the user or given by our own messages."""
     topics = {channel.topic for channel in channels}
     if any(motor.signals for motor in asked.motors.values()):
@@ -263,10 +267,10 @@ def _question_voltage(plan: MotorMap, channels: list[Channel]) -> list[Finding]:
         f"voltage: {name} is a speed command by its name; if a loop controls the speed, the "
         "estimates describe the loop, not the motor. Map the PWM or the voltage"
     )
-    return [found("speed_command", text, "warning" if scaled else "unreliable")]
+    return [make_finding("speed_command", text, "warning" if scaled else "unreliable")]
 
 
-def _description(
+def _find_description(
     wheel: str, plan: MotorMap, topics: list[str], tables: Mapping[str, Table]
 ) -> tuple[dict[str, float], list[Finding]]:
     """Return the last description of a wheel, and findings on it."""
@@ -280,23 +284,23 @@ def _description(
             text = (
                 f"{topic}: {', '.join(changed)} changed while recording; the last values are used"
             )
-            return last, [found("description_changed", text, "warning")] if changed else []
+            return last, [make_finding("description_changed", text, "warning")] if changed else []
     if "gear_ratio" not in plan.hardware:
         own = any(signal.field == "encoder_count" for signal in plan.signals.values())
         text = (
             f"{wheel}: {'no motor_description' if own else 'no gear_ratio'}; a gear ratio of 1 "
             "is assumed, so the parameters refer to the measured shaft"
         )
-        return {}, [found("gear_ratio_assumed", text)]
+        return {}, [make_finding("gear_ratio_assumed", text)]
     return {}, []
 
 
 def convert_description(message: Any) -> Hardware:
     """Return the hardware of a ``motor_description``."""
-    return hardware_of({name: float(getattr(message, name)) for name in mappings.DESCRIBED})
+    return make_hardware({name: float(getattr(message, name)) for name in mappings.DESCRIBED})
 
 
-def hardware_of(known: Mapping[str, float]) -> Hardware:
+def make_hardware(known: Mapping[str, float]) -> Hardware:
     """Return the known hardware; impossible values count as unknown."""
     sound: dict[str, Any] = {
         n: v for n, v in known.items() if math.isfinite(v) and (v > 0 or n in mappings.ACCURACIES)

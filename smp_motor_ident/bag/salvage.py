@@ -17,7 +17,7 @@ _LEAF = 0x0D
 _INTEGER_SIZE = {1: 1, 2: 2, 3: 3, 4: 4, 5: 6, 6: 8, 8: 0, 9: 0}
 
 
-def _varint(data: bytes, at: int) -> tuple[int, int]:
+def _read_varint(data: bytes, at: int) -> tuple[int, int]:
     """Return a number of one to nine bytes, and where the next begins."""
     value = 0
     for k in range(8):
@@ -28,7 +28,7 @@ def _varint(data: bytes, at: int) -> tuple[int, int]:
     return value << 8 | data[at + 8], at + 9
 
 
-def _integer(data: bytes, at: int, kind: int) -> int:
+def _read_integer(data: bytes, at: int, kind: int) -> int:
     if kind in (8, 9):
         return kind - 8
     return int.from_bytes(data[at : at + _INTEGER_SIZE[kind]], "big", signed=True)
@@ -74,23 +74,23 @@ class _Pages:
         return b"".join(parts)
 
 
-def _row(pages: _Pages, page: bytes, at: int) -> Row | None:
+def _read_row(pages: _Pages, page: bytes, at: int) -> Row | None:
     """Return the message in a cell, or None where it is something else."""
-    size, at = _varint(page, at)
-    key, at = _varint(page, at)
+    size, at = _read_varint(page, at)
+    key, at = _read_varint(page, at)
     record = pages.payload(page, at, size)
-    head, position = _varint(record, 0)
+    head, position = _read_varint(record, 0)
     kinds = []
     while position < head:
-        kind, position = _varint(record, position)
+        kind, position = _read_varint(record, position)
         kinds.append(kind)
     if len(kinds) != 4 or kinds[0] != 0 or kinds[3] < 12 or kinds[3] % 2:
         return None
     if kinds[1] not in _INTEGER_SIZE or kinds[2] not in _INTEGER_SIZE:
         return None
-    topic = _integer(record, head, kinds[1])
+    topic = _read_integer(record, head, kinds[1])
     at = head + _INTEGER_SIZE[kinds[1]]
-    stamp = _integer(record, at, kinds[2])
+    stamp = _read_integer(record, at, kinds[2])
     at += _INTEGER_SIZE[kinds[2]]
     length = (kinds[3] - 12) // 2
     data = record[at : at + length]
@@ -112,7 +112,7 @@ def salvage(path: Path) -> Iterator[list[Row]]:
             for k in range(int.from_bytes(page[3:5], "big")):
                 at = int.from_bytes(page[8 + 2 * k : 10 + 2 * k], "big")
                 try:
-                    row = _row(pages, page, at)
+                    row = _read_row(pages, page, at)
                 except IndexError:
                     continue
                 if row is not None:

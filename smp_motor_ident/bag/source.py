@@ -17,8 +17,8 @@ from smp_motor_control.errors import printable
 from smp_motor_control.parameter_file import load_bounded_yaml
 from smp_motor_ident.bag.readers import BAGS, PACKED, TABLES, is_table, open_source
 from smp_motor_ident.bag.readers.format import Messages, Tables, check_width
-from smp_motor_ident.bag.storage import TABLE, Batch, Channel, Table, damaged, found
-from smp_motor_ident.bag.unpack import Budget, folder_of
+from smp_motor_ident.bag.storage import TABLE, Batch, Channel, Table, make_finding, report_damage
+from smp_motor_ident.bag.unpack import Budget, make_temporary_folder
 from smp_motor_ident.errors import BagError
 from smp_motor_ident.finding import Finding
 
@@ -82,20 +82,20 @@ class Recording:
 
     @cached_property
     def _folder(self) -> Path:
-        return folder_of(self)
+        return make_temporary_folder(self)
 
     def channels(self) -> list[Channel]:
         """Return the channels of all files, one per topic, type and file."""
         every: list[Channel] = []
         for path in self.files:
-            if (source := self._source(path)) is not None:
-                every += [replace(c, topic=self._topic(path, c)) for c in source.channels()]
-                self._note(*source.problems)
+            if (source := self._open(path)) is not None:
+                every += [replace(c, topic=self._name_topic(path, c)) for c in source.channels()]
+                self._add_findings(*source.problems)
         check_width(len({c.topic for c in every}), self.name, "topics")
         check_width(sum(len(c.fields) for c in every), self.name)
         return every
 
-    def _topic(self, path: Path, channel: Channel) -> str:
+    def _name_topic(self, path: Path, channel: Channel) -> str:
         """Return a channel's topic, which begins with the file's name for one of several tables."""
         if channel.encoding != TABLE or len(self.files) == 1:
             return channel.topic
@@ -104,9 +104,9 @@ class Recording:
     def table(self, topic: str, fields: Sequence[str]) -> Table:
         """Return columns of a table."""
         for path in self.files:
-            if isinstance(source := self._source(path), Tables):
+            if isinstance(source := self._open(path), Tables):
                 for channel in source.channels():
-                    if self._topic(path, channel) == topic:
+                    if self._name_topic(path, channel) == topic:
                         return source.table(channel.topic, fields)
         raise BagError(f"{self.name}: has no {topic or 'table'}")
 
@@ -115,7 +115,7 @@ class Recording:
         counts: Counter[str] = Counter()
         seen: set[str] = set()
         for path in self.files:
-            source = cast("Messages | None", self._source(path))
+            source = cast("Messages | None", self._open(path))
             if source is not None:
                 mine: Counter[str] = Counter()
                 for batches in source.batches(wanted):
@@ -124,26 +124,28 @@ class Recording:
                     yield batches
                 asked = {c.topic for c in source.channels() if wanted(c)}
                 seen |= asked
-                self._note(*source.problems)
+                self._add_findings(*source.problems)
                 for topic, count in (source.declared() or {}).items():
                     if topic in asked and mine[topic] < count:
-                        self._lost(path.name, topic, mine[topic], count)
+                        self._report_loss(path.name, topic, mine[topic], count)
                 counts += mine
         for topic, count in (self.declared or {}).items():
             if topic in seen and counts[topic] < count:
-                self._lost("metadata.yaml", topic, counts[topic], count)
+                self._report_loss("metadata.yaml", topic, counts[topic], count)
 
-    def _note(self, *findings: Finding) -> None:
+    def _add_findings(self, *findings: Finding) -> None:
         self.findings += [f for f in findings if f not in self.findings]
 
-    def _lost(self, who: str, topic: str, have: int, declared: int) -> None:
+    def _report_loss(self, who: str, topic: str, have: int, declared: int) -> None:
         text = (
             f"{self.name}: {topic}: {have} of {declared} messages could be read "
             f"({who} counts {declared}; {declared - have} are lost)"
         )
-        self._note(found("messages_lost", text, "warning", read=have, counted=declared))
+        self._add_findings(
+            make_finding("messages_lost", text, "warning", read=have, counted=declared)
+        )
 
-    def _source(self, path: Path) -> Messages | Tables | None:
+    def _open(self, path: Path) -> Messages | Tables | None:
         """Open a file; an unreadable one among several becomes a finding."""
         if path not in self._sources:
             try:
@@ -157,7 +159,7 @@ class Recording:
                 if len(self.files) == 1 or self.is_table:
                     raise
                 self._sources[path] = None
-                self._note(damaged(str(error)))
+                self._add_findings(report_damage(str(error)))
         return self._sources[path]
 
 
@@ -175,7 +177,7 @@ def find_recordings(paths: Any, topics: Collection[str] = ()) -> list[Recording]
         if not (path.is_dir() or path.is_file()):
             raise BagError(f"{path}: is a pipe or a device; save its output as a file")
         try:
-            inside = _of_folder(path) if path.is_dir() else [Recording(path.name, [path])]
+            inside = _search_folder(path) if path.is_dir() else [Recording(path.name, [path])]
         except OSError as error:
             raise BagError(f"{path}: cannot be read ({error.strerror})") from None
         for recording in inside:
@@ -217,7 +219,7 @@ def _join_topics(every: list[Recording], topics: Collection[str]) -> list[Record
     return [whole, *(r for r in every if r not in parts and not r.is_table)]
 
 
-def _of_folder(top: Path) -> list[Recording]:
+def _search_folder(top: Path) -> list[Recording]:
     """Return the recordings of a folder: one bag, or its contents; skip links to parents."""
     every: list[Recording] = []
     waiting, seen = [top], set[tuple[int, int]]()
@@ -227,35 +229,35 @@ def _of_folder(top: Path) -> list[Recording]:
             continue
         seen.add(place)
         if (path / "metadata.yaml").is_file():
-            every.append(_bag(path))
+            every.append(_read_bag_folder(path))
             continue
         here = sorted(path.iterdir())
-        every += _of_files(_name(path), [p for p in here if p.is_file()])
+        every += _group_files(_name_folder(path), [p for p in here if p.is_file()])
         waiting += [p for p in reversed(here) if p.is_dir() and not p.name.startswith(".")]
     return every
 
 
-def _name(path: Path) -> str:
+def _name_folder(path: Path) -> str:
     return path.name if path.name.strip(".") else path.resolve().name
 
 
-def _of_files(name: str, here: Sequence[Path]) -> list[Recording]:
+def _group_files(name: str, here: Sequence[Path]) -> list[Recording]:
     """Return the recordings among the files of a folder without metadata."""
     groups: dict[str, list[Path]] = {}
-    for file in _storages(here):
+    for file in _select_bag_files(here):
         split = _SPLIT.match(_stem(file))
         groups.setdefault(split[1] if split else _stem(file), []).append(file)
     text = f"{name}: has no metadata.yaml; all its files are read"
     every = []
     for key, files in groups.items():
-        amiss = [] if files[0].suffix == ".bag" else [found("no_metadata", text)]
+        amiss = [] if files[0].suffix == ".bag" else [make_finding("no_metadata", text)]
         whole = name if len(groups) == 1 else f"{name}/{key}"
-        every.append(Recording(whole, sorted(files, key=_order), findings=amiss))
+        every.append(Recording(whole, sorted(files, key=_sort_key), findings=amiss))
     tables = [s for s in TABLES if s not in _NAMED_ONLY]
     return every + [Recording(p.name, [p]) for p in here if p.suffix.lower() in tables]
 
 
-def _storages(files: Iterable[Path]) -> list[Path]:
+def _select_bag_files(files: Iterable[Path]) -> list[Path]:
     """Return the bag files, each once where it is there both plain and compressed."""
     storages = [p for p in files if _BAG_NAME.search(p.name) and p.suffix in (*BAGS, *PACKED)]
     plain = {p.name for p in storages if p.suffix in BAGS}
@@ -266,15 +268,15 @@ def _stem(path: Path) -> str:
     return _BAG_NAME.sub("", path.name)
 
 
-def _order(path: Path) -> tuple[str, int]:
+def _sort_key(path: Path) -> tuple[str, int]:
     match = re.fullmatch(r"(.*?)_?(\d*)", _stem(path))
     assert match is not None
     return match[1], int(match[2] or 0)
 
 
-def _bag(path: Path) -> Recording:
+def _read_bag_folder(path: Path) -> Recording:
     """Return a bag by its metadata.yaml, of any version, ignoring invalid entries."""
-    name = _name(path)
+    name = _name_folder(path)
     bag = Recording(name, [])
     try:
         with (path / "metadata.yaml").open("rb") as metadata:
@@ -290,24 +292,26 @@ def _bag(path: Path) -> Recording:
     except (yaml.YAMLError, ValueError, OSError, ArithmeticError) as error:
         reason = " ".join(str(error).split())[:200] or type(error).__name__
         bag.findings.append(
-            damaged(f"{name}: metadata.yaml is damaged ({reason}); all files are read")
+            report_damage(f"{name}: metadata.yaml is damaged ({reason}); all files are read")
         )
         bag.declared, listed = None, []
-    there = _storages(sorted(path.iterdir()))
+    there = _select_bag_files(sorted(path.iterdir()))
     for file in listed:
         options = [file, file.removesuffix(Path(file).suffix), f"{file}.zstd", f"{file}.lz4"]
         match = next((path / o for o in options if o and (path / o).is_file()), None)
         if match is None:
-            bag.findings.append(damaged(f"{name}: {file} is missing, which metadata.yaml lists"))
+            bag.findings.append(
+                report_damage(f"{name}: {file} is missing, which metadata.yaml lists")
+            )
         elif match not in bag.files:
             bag.files.append(match)
-    extra = sorted((f for f in there if f not in bag.files), key=_order)
+    extra = sorted((f for f in there if f not in bag.files), key=_sort_key)
     stems = {_stem(file) for file in bag.files}
     extra = [file for file in extra if _stem(file) not in stems]
     if extra and listed:
         names = ", ".join(file.name for file in extra)
         text = f"{name}: {names} is not listed in metadata.yaml and is read too"
-        bag.findings.append(found("unlisted_files", text))
+        bag.findings.append(make_finding("unlisted_files", text))
     bag.files += extra
     if not bag.files:
         reason = bag.findings[-1].message if bag.findings else "holds no .mcap or .db3"

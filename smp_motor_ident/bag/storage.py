@@ -17,12 +17,14 @@ Bytes = NDArray[np.uint8]
 TABLE = "table"  # encoding of a channel whose file holds columns of numbers instead of messages
 
 
-def found(code: str, message: str, severity: Severity = "note", **evidence: float) -> Finding:
+def make_finding(
+    code: str, message: str, severity: Severity = "note", **evidence: float
+) -> Finding:
     """Return a finding made while reading."""
     return Finding(code, severity, message, evidence)
 
 
-def damaged(message: str) -> Finding:
+def report_damage(message: str) -> Finding:
     """Return a finding on a lost part of a recording."""
     return Finding("damaged_recording", "warning", message)
 

@@ -14,9 +14,9 @@ from smp_motor_ident import limits
 from smp_motor_ident.bag import clock, units
 from smp_motor_ident.bag.mapping import DEFAULT_MOTOR, MotorMap, Signal, SignalMap
 from smp_motor_ident.bag.names import MOTIONS, separates_motors
-from smp_motor_ident.bag.readers.grid import without_unit
+from smp_motor_ident.bag.readers.grid import strip_unit
 from smp_motor_ident.bag.source import Recording
-from smp_motor_ident.bag.storage import TABLE, Channel, Table, found
+from smp_motor_ident.bag.storage import TABLE, Channel, Table, make_finding
 from smp_motor_ident.errors import BagError
 from smp_motor_ident.finding import Finding
 
@@ -51,33 +51,33 @@ def resolve_signals(plan: MotorMap, channels: list[Channel]) -> MotorMap:
                 signals[name] = replace(signal, topic=topic, field=signal.field[len(topic) + 1 :])
                 break
     if tables := [channel for channel in channels if channel.encoding == TABLE]:
-        signals = {name: _resolved(name, signal, tables) for name, signal in signals.items()}
+        signals = {name: _resolve_signal(name, signal, tables) for name, signal in signals.items()}
     return replace(plan, signals=signals)
 
 
-def _resolved(name: str, signal: Signal, tables: list[Channel]) -> Signal:
+def _resolve_signal(name: str, signal: Signal, tables: list[Channel]) -> Signal:
     """Find a signal's column: of a topic, of the only table, or an entry that is one signal."""
     whole = f"{signal.topic}.{signal.field}" if signal.topic else signal.field
     entry = re.fullmatch(r"(.+?)((?:\[\d+\])?)", whole)
     choices = [(signal.topic, signal.field), ("", whole)]
     choices += [(entry[1], "value" + entry[2])] if entry else []
     every = choices + [(c.topic, signal.field) for c in tables if not signal.topic]
-    bare = [(c.topic, n) for c in tables for n in c.fields if without_unit(n) == signal.field]
+    bare = [(c.topic, n) for c in tables for n in c.fields if strip_unit(n) == signal.field]
     for topic, field in every + (bare if len(bare) == 1 and not signal.topic else []):
         for channel in tables:
             if channel.topic == topic and field in channel.fields:
-                unit = _unit(name, signal, channel, field)
+                unit = _choose_unit(name, signal, channel, field)
                 return replace(signal, topic=topic, field=field, unit=unit)
     if len(tables) == 1:  # the table says which columns it has
         return replace(signal, topic=tables[0].topic, field=whole)
     return signal
 
 
-def _unit(name: str, signal: Signal, channel: Channel, field: str) -> str:
+def _choose_unit(name: str, signal: Signal, channel: Channel, field: str) -> str:
     """Return a signal's unit: as mapped, else as the file writes it."""
     if signal.unit or (signal.scale, signal.offset) != (1.0, 0.0):
         return signal.unit
-    return units.unit_of(name, channel.units.get(field, ""), field)
+    return units.find_unit(name, channel.units.get(field, ""), field)
 
 
 def plan_from_names(recording: Recording, asked: SignalMap) -> dict[str, MotorMap]:
@@ -128,7 +128,9 @@ def _time_signal(recording: Recording, plan: MotorMap, topic: str) -> Signal | N
     if mapped is not None:
         own = mapped.field in channel.fields and (topic, mapped.field) not in others
         if mapped.topic == topic or own:
-            return replace(mapped, topic=topic, unit=_unit("time", mapped, channel, mapped.field))
+            return replace(
+                mapped, topic=topic, unit=_choose_unit("time", mapped, channel, mapped.field)
+            )
         if len(channel.fields) == 1 and mapped.topic:
             return mapped  # the time of its rows is in another file
     if plan.sample_time:
@@ -136,7 +138,7 @@ def _time_signal(recording: Recording, plan: MotorMap, topic: str) -> Signal | N
     likely = [name for name in channel.fields if re.search(TIME_NAMES, name, re.IGNORECASE)]
     if mapped is not None and likely:
         signal = Signal(topic, likely[0])
-        return replace(signal, unit=_unit("time", signal, channel, likely[0]))
+        return replace(signal, unit=_choose_unit("time", signal, channel, likely[0]))
     hint = f"time={likely[0]}" if likely else "time=COLUMN"
     raise BagError(
         f"{recording.files[0]}: the column of time is unknown; map {hint} or sample_time=SECONDS"
@@ -170,8 +172,8 @@ def separate_motors(
                 f"{recording.name}: {column} separates the rows of {len(own)} motors: "
                 f"{', '.join(own)}"
             )
-            finding = found("several_motors", text, motors=len(own))
-            motors = [_rows(tables[topic], of == n, finding) for n in numbers]
+            finding = make_finding("several_motors", text, motors=len(own))
+            motors = [_select_rows(tables[topic], of == n, finding) for n in numbers]
             before = "" if wheel == DEFAULT_MOTOR else f"{wheel}_"
             return [(before + n, {**tables, topic: rows}) for n, rows in zip(own, motors)]
     return [(wheel, tables)]
@@ -184,7 +186,7 @@ def _motor_columns(recording: Recording, topic: str) -> dict[str, tuple[str, ...
     return {name: own for name, own in words.items() if separates_motors(name, own)}
 
 
-def _rows(table: Table, which: Flags, finding: Finding) -> Table:
+def _select_rows(table: Table, which: Flags, finding: Finding) -> Table:
     """Return some rows of a table as they are in the file."""
     columns = {name: column[which] for name, column in table.columns.items()}
     log = None if table.log is None else table.log[which]
@@ -209,7 +211,7 @@ def add_times(
                 log = np.rint(np.arange(size) * (plan.sample_time * 1e9)).astype(np.int64)
             else:
                 of = tables[signal.topic]
-                log, unit = _nanoseconds(of, signal)
+                log, unit = _read_nanoseconds(of, signal)
                 if log.size != size:
                     raise BagError(
                         f"{recording.name}: {topic} has {size} rows, and their time "
@@ -219,12 +221,12 @@ def add_times(
                     _check_seconds(log, signal, recording)
                 if unit and unit != signal.unit:
                     text = f"{recording.name}: {signal.field} is read as {unit} since 1970"
-                    findings.append(found("time_unit", text))
+                    findings.append(make_finding("time_unit", text))
         sound = log > clock.MISSING_TIME
         columns = table.columns
         if not sound.all():
             text = f"{recording.name}: {int((~sound).sum())} rows without time were left out"
-            findings.append(found("rows_without_time", text, "warning"))
+            findings.append(make_finding("rows_without_time", text, "warning"))
             log, columns = log[sound], {name: c[sound] for name, c in columns.items()}
         if not log.size:
             raise BagError(
@@ -237,7 +239,7 @@ def add_times(
             )
         result[topic] = Table(log, None, columns, findings=findings, clocked=True)
     rows = {topic: result[topic] for topic in written}
-    return result | clock.lay_out_runs(rows, plan.gap, recording.name)
+    return result | clock.concatenate_runs(rows, plan.gap, recording.name)
 
 
 def _check_seconds(log: Integers, signal: Signal, recording: Recording) -> None:
@@ -251,7 +253,7 @@ def _check_seconds(log: Integers, signal: Signal, recording: Recording) -> None:
         )
 
 
-def _nanoseconds(table: Table, signal: Signal) -> tuple[Integers, str]:
+def _read_nanoseconds(table: Table, signal: Signal) -> tuple[Integers, str]:
     """Return the times of a table, `NEVER` for missing cells, and an inferred unit."""
     column = table.columns[signal.field]
     if signal.field in table.exact:

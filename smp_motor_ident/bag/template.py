@@ -16,10 +16,14 @@ from rosbags.interfaces import Nodetype
 from smp_motor_ident.bag.types import Definitions
 from smp_motor_ident.errors import BagError
 
-_NUMPYS = ("float32", "float64", *(f"{u}int{bits}" for u in ("", "u") for bits in (8, 16, 32, 64)))
-_KINDS = {name: np.dtype(name).str[1:] for name in _NUMPYS}
+_NUMBER_TYPES = (
+    "float32",
+    "float64",
+    *(f"{u}int{bits}" for u in ("", "u") for bits in (8, 16, 32, 64)),
+)
+_KINDS = {name: np.dtype(name).str[1:] for name in _NUMBER_TYPES}
 _KINDS |= dict.fromkeys(("bool", "byte", "char", "octet"), "u1")
-_MOST_ELEMENTS = 100_000  # messages inside one
+_MAX_ELEMENTS = 100_000  # messages inside one
 _STEP = re.compile(r"(\w+)((?:\[[^\]]*\])*)")
 
 
@@ -85,7 +89,7 @@ class _Parser:
         self.ros1 = ros1
         self.order = "<" if ros1 or data[1] else ">"
         self.lengths: list[int] = []
-        self.left = min(_MOST_ELEMENTS, 64 + 4 * len(data))
+        self.left = min(_MAX_ELEMENTS, 64 + 4 * len(data))
 
     def parse(self, name: str) -> Template:
         root = self.message(name)

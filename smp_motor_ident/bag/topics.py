@@ -58,7 +58,7 @@ def describe_topics(recording: source.Recording, types: Types) -> list[TopicInfo
         return [
             TopicInfo(c.topic, c.type, count, fields=fields, table=True, units=c.units)
             for c in recording.channels()
-            for count, fields in _by_length(c)
+            for count, fields in _group_by_length(c)
         ]
     found: dict[str, TopicInfo] = {}
     spans: dict[str, tuple[int, int]] = {}
@@ -69,7 +69,7 @@ def describe_topics(recording: source.Recording, types: Types) -> list[TopicInfo
         info = found.setdefault(topic, TopicInfo(topic, batch.channel.type))
         if not info.count:
             plain, _ = unpack.decompress_messages(batch.take(np.arange(1)), recording.budget)
-            info.fields, info.remark = _fields(types, plain) if len(plain) else ([], "damaged")
+            info.fields, info.remark = _list_fields(types, plain) if len(plain) else ([], "damaged")
         info.count += len(batch)
         first, last = spans.get(topic, (2**63 - 1, -(2**63)))
         times = batch.log_time
@@ -80,7 +80,7 @@ def describe_topics(recording: source.Recording, types: Types) -> list[TopicInfo
     return [found[topic] for topic in sorted(found)]
 
 
-def _by_length(channel: storage.Channel) -> list[tuple[int, list[str]]]:
+def _group_by_length(channel: storage.Channel) -> list[tuple[int, list[str]]]:
     """Return the columns of a table by their length, the longest first; 0 where all have one."""
     if not channel.lengths:
         return [(0, list(channel.fields))]
@@ -90,7 +90,7 @@ def _by_length(channel: storage.Channel) -> list[tuple[int, list[str]]]:
     return sorted(groups.items(), reverse=True)
 
 
-def _fields(types: Types, batch: Any) -> tuple[list[str], str]:
+def _list_fields(types: Types, batch: Any) -> tuple[list[str], str]:
     """Return the numeric fields of a batch's first message, or why they are unknown."""
     channel, reason = batch.channel, ""
     if channel.encoding not in ("cdr", "ros1"):
@@ -104,17 +104,19 @@ def _fields(types: Types, batch: Any) -> tuple[list[str], str]:
             except template.DecodeError as error:
                 reason = str(error)
                 continue
-            fields = (_paths(name, value, root) for name, value in root.items() if name != "header")
+            fields = (
+                _list_paths(name, value, root) for name, value in root.items() if name != "header"
+            )
             return list(chain.from_iterable(fields)), ""
     except BagError:
         return [], "unknown type: give its .msg files"
     return [], f"does not match its type: {reason}"
 
 
-def _paths(path: str, value: Any, parent: dict[str, Any]) -> Iterator[str]:
+def _list_paths(path: str, value: Any, parent: dict[str, Any]) -> Iterator[str]:
     if isinstance(value, dict):
         for name, inner in value.items():
-            yield from _paths(f"{path}.{name}", inner, value)
+            yield from _list_paths(f"{path}.{name}", inner, value)
     elif isinstance(value, template.Number) and value.count is None:
         yield path
     elif isinstance(value, template.Number) or (
@@ -128,4 +130,4 @@ def _paths(path: str, value: Any, parent: dict[str, Any]) -> Iterator[str]:
                 break
         for k, key in enumerate(keys):
             inner = value[k] if isinstance(value, list) else template.Number(0, "")
-            yield from _paths(f"{path}[{key}]", inner, parent)
+            yield from _list_paths(f"{path}[{key}]", inner, parent)

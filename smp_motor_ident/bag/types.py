@@ -24,7 +24,7 @@ Lookup = Callable[[str], Fields | None]
 
 _STORES = (Stores.ROS2_JAZZY, Stores.ROS2_HUMBLE, Stores.ROS2_FOXY, Stores.ROS2_DASHING)
 _DAMAGE = (TypesysError, BagError, ValueError, LookupError, TypeError, RecursionError)
-_LINE = "=" * 80 + "\n"
+_DIVIDER = "=" * 80 + "\n"
 
 
 @lru_cache(maxsize=512)
@@ -35,9 +35,9 @@ def _parse(text: str, name: str, form: str) -> dict[str, Fields]:
         raise BagError(
             f"its definition has {len(text)} characters, more than {MAX_DEFINITION_SIZE:.0f}"
         )
-    if form == "ros2idl" or text.startswith(_LINE + "IDL: "):
+    if form == "ros2idl" or text.startswith(_DIVIDER + "IDL: "):
         types: dict[str, Any] = {}
-        parts = text.split(_LINE)[1:] if text.startswith(_LINE) else [f"IDL:\n{text}"]
+        parts = text.split(_DIVIDER)[1:] if text.startswith(_DIVIDER) else [f"IDL:\n{text}"]
         for part in parts:
             types.update(typesys.get_types_from_idl(part.partition("\n")[2]))
     else:
@@ -55,13 +55,13 @@ def _references(fields: Fields) -> Iterator[str]:
 
 
 @cache
-def _stored(which: Stores, name: str) -> Fields | None:
+def _find_stored(which: Stores, name: str) -> Fields | None:
     """Return a type of a distribution, whose types are loaded when one is asked for."""
     found = get_typestore(which).fielddefs.get(name)
     return None if found is None else found[1]
 
 
-def _ament_file(name: str, suffix: str) -> Path | None:
+def _find_installed_file(name: str, suffix: str) -> Path | None:
     """Return a file of an installed interface package, such as its ``.msg``."""
     package, _, kind = name.split("/")
     for prefix in os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep):
@@ -101,19 +101,19 @@ class Types:
         does not define its types, the one that fits the bytes is right.
         """
         name, reasons = channel.type, []
-        stores: list[Lookup] = [partial(_stored, which) for which in _STORES]
+        stores: list[Lookup] = [partial(_find_stored, which) for which in _STORES]
         if channel.definition:
             try:
-                self._count(channel.definition)
+                self._count_definition(channel.definition)
                 own = _parse(channel.definition, name, channel.definition_format)
-                yield self._closed(name, [own.get, self._given.get, *stores])
+                yield self._resolve_references(name, [own.get, self._given.get, *stores])
             except _DAMAGE as error:
                 reasons.append(f"the bag's own definition cannot be used: {first_line(error)}")
-        given: list[Lookup] = [self._named(name).get, self._given.get]
-        known = [[_ament, stores[0]], *([store, _ament] for store in stores[1:])]
+        given: list[Lookup] = [self._find_by_last_name(name).get, self._given.get]
+        known = [[_find_installed, stores[0]], *([store, _find_installed] for store in stores[1:])]
         for sources in known:
             try:
-                yield self._closed(name, [*given, *sources])
+                yield self._resolve_references(name, [*given, *sources])
             except (TypesysError, BagError) as error:
                 reasons.append(first_line(error))
         if len(reasons) == len(known) + bool(channel.definition):
@@ -122,21 +122,21 @@ class Types:
                 f"({reasons[0]}); give its definition as .msg files"
             )
 
-    def _count(self, text: str) -> None:
+    def _count_definition(self, text: str) -> None:
         """Refuse definitions that are too long together."""
         self._left -= 0 if text in self._seen else len(text)
         self._seen.add(text)
         if self._left < 0:
             raise BagError(f"definitions have more than {6 * MAX_DEFINITION_SIZE:.0f} characters")
 
-    def _named(self, name: str) -> dict[str, Fields]:
+    def _find_by_last_name(self, name: str) -> dict[str, Fields]:
         """Return a definition by the type's last name where the user's folder says no package."""
         if name in self._given:
             return {}
         same = [key for key in self._given if key.rpartition("/")[2] == name.rpartition("/")[2]]
         return {name: self._given[same[0]]} if len(same) == 1 else {}
 
-    def _closed(self, name: str, sources: Sequence[Lookup]) -> Definitions:
+    def _resolve_references(self, name: str, sources: Sequence[Lookup]) -> Definitions:
         """Return the type and all that it refers to, each from the first source that has it."""
         closed: dict[str, Fields] = {}
         open_names = [name]
@@ -152,16 +152,16 @@ class Types:
         return closed
 
 
-def _ament(name: str) -> Fields | None:
+def _find_installed(name: str) -> Fields | None:
     """Return a type of the interface packages on AMENT_PREFIX_PATH."""
-    return None if (text := _msg_text(name)) is None else _parse(text, name, "")[name]
+    return None if (text := _read_msg_file(name)) is None else _parse(text, name, "")[name]
 
 
 @cache
-def _msg_text(name: str) -> str | None:
+def _read_msg_file(name: str) -> str | None:
     if name.count("/") != 2:
         return None
-    path = _ament_file(name, ".msg")
+    path = _find_installed_file(name, ".msg")
     return path.read_text() if path else None
 
 
@@ -170,12 +170,12 @@ def definition(name: str) -> tuple[str, str]:
     name = message_type(name)
     types = Types()
     closed = next(types.candidates(Channel(0, name, name)))
-    texts = {key: _msg_text(key) for key in closed}
+    texts = {key: _read_msg_file(key) for key in closed}
     if all(text is not None for text in texts.values()):
         whole = [texts.pop(name) or ""]
         whole += [f"MSG: {key.replace('/msg/', '/')}\n{text}" for key, text in texts.items()]
-        text = ("\n" + _LINE).join(whole)
-        if (path := _ament_file(name, ".json")) is not None:
+        text = ("\n" + _DIVIDER).join(whole)
+        if (path := _find_installed_file(name, ".json")) is not None:
             hashes = json.loads(path.read_text())["type_hashes"]
             own = [h["hash_string"] for h in hashes if h["type_name"] == name]
             if own:

@@ -105,7 +105,7 @@ def needs(signal: str, unit: str, name: str) -> bool:
     return one is not None and name in one.needs
 
 
-def written_unit(text: str) -> str | None:
+def parse_unit(text: str) -> str | None:
     """Return the unit that a file writes next to a column's name; None if it is not a unit.
 
     It is a symbol, or in words as WPILib writes it: "Rotation per Second", "turns_per_second".
@@ -126,7 +126,7 @@ def _abbreviate(text: str) -> str:
     return "/".join(_WORDS.get(part.strip().removesuffix("s"), part) for part in parts)
 
 
-def unit_of(signal: str, written: str, name: str) -> str:
+def find_unit(signal: str, written: str, name: str) -> str:
     """Return the unit that a file states for a signal, or else one in the signal's name.
 
     Empty for SI.  A single letter is not a unit: ``theta_m`` is the motor's angle.  The vectors of

@@ -56,7 +56,7 @@ class Budget:
             )
 
 
-def folder_of(owner: object) -> Path:
+def make_temporary_folder(owner: object) -> Path:
     """Return a new folder for unpacked or repaired files, deleted with its owner."""
     folder = tempfile.mkdtemp(prefix="smp_bag_")
     weakref.finalize(owner, shutil.rmtree, folder, ignore_errors=True)
@@ -75,7 +75,7 @@ def _read_user_limit() -> int:
         raise BagError(f"{VARIABLE} is {text!r}; give bytes, or such as 512M or 8G") from None
 
 
-def pieces(blocks: Iterable[bytes], kind: str) -> Iterator[bytes]:
+def decompress_stream(blocks: Iterable[bytes], kind: str) -> Iterator[bytes]:
     """Unpack all frames of a stream; EOFError where it is cut off."""
     engine: Any = None
     for block in blocks:
@@ -100,7 +100,7 @@ def decompress(data: bytes, compression: str, budget: Budget) -> bytes:
         raise BagError(f"compression {compression!r} is not supported; use zstd, lz4 or bz2")
     parts: list[bytes] = []
     try:
-        for piece in pieces([data], compression):
+        for piece in decompress_stream([data], compression):
             budget.take(len(piece))
             parts.append(piece)
     except _DAMAGE:
@@ -112,7 +112,7 @@ def unpack_file(path: Path, plain: Path, kind: str, budget: Budget) -> str:
     """Decompress a file; return a remark on damage, empty if it is whole."""
     try:
         with path.open("rb") as packed, plain.open("wb") as out:
-            for piece in pieces(iter(lambda: packed.read(1 << 16), b""), kind):
+            for piece in decompress_stream(iter(lambda: packed.read(1 << 16), b""), kind):
                 budget.take(len(piece))
                 out.write(piece)
     except EOFError:

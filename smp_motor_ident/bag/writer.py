@@ -47,7 +47,7 @@ class _Plain(getattr(yaml, "CSafeDumper", yaml.SafeDumper)):  # type: ignore[mis
         return True
 
 
-def _dumped(content: Any) -> str:
+def _dump_yaml(content: Any) -> str:
     return str(yaml.dump(content, Dumper=_Plain, sort_keys=False))
 
 
@@ -143,7 +143,7 @@ class BagWriter:
             schema, type_hash = self._schema(type_name)
             profiles = [{**DEFAULT_QOS, **profile} for profile in qos or [{}]]
             described = {
-                "offered_qos_profiles": _dumped(profiles),
+                "offered_qos_profiles": _dump_yaml(profiles),
                 "topic_type_hash": type_hash,
                 **({SEQUENCE_KEY: "true"} if numbered else {}),
             }
@@ -252,7 +252,7 @@ class BagWriter:
         }
         target = self.path / "metadata.yaml"
         draft = target.with_suffix(".yaml.new")
-        draft.write_text(_dumped({"rosbag2_bagfile_information": information}))
+        draft.write_text(_dump_yaml({"rosbag2_bagfile_information": information}))
         draft.replace(target)
 
     def close(self) -> None:

@@ -102,7 +102,7 @@ def evaluate_changes(
     """Return the changes of one wheel, and its longest wait for an answer [s]."""
     state, answers = driven.state, driven.answers
     estimate, entry = given.estimates[wheel], given.document[wheel]
-    delays = verification.arrival_delays(
+    delays = verification.measure_arrival_delays(
         (answers.seconds, answers.columns["age"], answers.columns["output"]),
         (state.seconds, state.columns["voltage"]),
         entry["loop"],
@@ -139,7 +139,7 @@ def evaluate_changes(
     for one in moves:
         since = even - one.begin
         kept = (since >= 0.0) & (since < one.lasts - 0.05)
-        changes.append(verification.change_of(
+        changes.append(verification.read_change(
             wheel, one.name, one.setpoint, since[kept], speed[kept], rows[:, kept],
             entry["specification"], unsure, before=one.before,
         ))  # fmt: skip

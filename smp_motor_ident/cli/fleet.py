@@ -69,7 +69,7 @@ def work(
     write_together(pages, arguments.force)
     if not arguments.quiet:
         for mark in marks:
-            what = words.put_within(mark.quantity)
+            what = words.label_in_sentence(mark.quantity)
             print(f"{mark.kind}: {fleet.name_motor(mark)}: {what} {mark.text}")
         print(f"written: {', '.join(map(str, pages))}")
     return int(any(row.failure or row.unreliable for row in rows))

@@ -207,9 +207,9 @@ def _tunings(outcomes: Mapping[str, Outcome], say: Callable[..., None]) -> dict[
         except SmpError as error:  # such as of a motor whose supply is not known
             unknown[wheel] = tuning_page.Tuning(wheel, reason=str(error))
 
-    designs, refused = tuning_page.designs_of({w: known[w] for w in loops}, loops)
+    designs, refused = tuning_page.design_all_wheels({w: known[w] for w in loops}, loops)
     jobs = {
-        wheel: lambda _, w=wheel, own=own: tuning_page.tuning_of(known[w], loops[w], own)
+        wheel: lambda _, w=wheel, own=own: tuning_page.design_tuning(known[w], loops[w], own)
         for wheel, own in designs.items()
     }
     return {**unknown, **refused, **workers.in_parallel(jobs, say, "designing for")}

@@ -15,7 +15,7 @@ from smp_motor_ident.cli.processes import connect
 from smp_motor_ident.errors import DesignError, ParameterError
 from smp_motor_ident.report.document import check_free, write_together
 from smp_motor_ident.tune.methods.relay import read_oscillation
-from smp_motor_ident.tune.methods.rules import by_rule
+from smp_motor_ident.tune.methods.rules import apply_rule
 
 BIAS_SHARE = 0.4
 """Share of the supply around which the relay switches, so that friction is not crossed."""
@@ -48,7 +48,7 @@ def tune_by_relay(arguments: argparse.Namespace, files: Sequence[Path]) -> int:
         seen = run_relay_test(robot, wheel, relay, arguments.relay_seconds)
     gain, period = read_oscillation(*resample_evenly(seen))
     rule, structure = arguments.rule or "tyreus_luyben", arguments.structure or "pi"
-    ruled = by_rule(rule, structure, gain, period)
+    ruled = apply_rule(rule, structure, gain, period)
     line = (
         f"{wheel}: ultimate gain {gain:.4g} V s/rad (wheel), period {1e3 * period:.3g} ms; {rule}: "
         f"p {ruled.p:.4g}, i {ruled.i:.4g}, d {ruled.d:.4g}"

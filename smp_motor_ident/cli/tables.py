@@ -60,7 +60,7 @@ def _values(estimate: Estimate, intervals: bool) -> Table:
         column.justify = "left"
     made.columns[-1].no_wrap = False
     for name, quantity in held.items():
-        if words.is_told(quantity):
+        if words.is_stated(quantity):
             remark = [words.systematic(quantity)]
             if quantity.status != "estimated":
                 remark.append(words.status(quantity))
@@ -70,7 +70,7 @@ def _values(estimate: Estimate, intervals: bool) -> Table:
             if intervals:
                 cells.append("" if quantity.value is None else words.interval(quantity))
             made.add_row(*cells, ", ".join(filter(None, remark)))
-    hidden = [words.put_within(n) for n, q in held.items() if not words.is_told(q)]
+    hidden = [words.label_in_sentence(n) for n, q in held.items() if not words.is_stated(q)]
     if hidden:
         made.caption = f"not identifiable: {', '.join(hidden)}"
         made.caption_justify = "left"

@@ -23,7 +23,7 @@ from smp_motor_ident.tune.curves import curves
 from smp_motor_ident.tune.exports import FORMATS, export
 from smp_motor_ident.tune.source import choose_source
 from smp_motor_ident.tune.wheels import WheelSet
-from smp_motor_ident.tune.writing import gains_document, gains_yaml, parameters, slow_loop
+from smp_motor_ident.tune.writing import describe_slow_loop, gains_document, gains_yaml, parameters
 
 DEFAULT_RATE = 200.0  # steps per second where neither the user nor the identification says [Hz]
 SOURCES_S, COMPARISON_S, DESIGN_S = 1.0, 3.0, 2.0
@@ -300,7 +300,7 @@ def print_designs(wheels: WheelSet) -> None:
 
 def describe_design(design: Design) -> list[str]:
     """Return settling, reason and warnings of a design."""
-    warnings = (f"warning: {one}" for one in (*design.warnings, *slow_loop(design)))
+    warnings = (f"warning: {one}" for one in (*design.warnings, *describe_slow_loop(design)))
     return [design.settling.describe(), design.reason, *warnings]
 
 

@@ -57,8 +57,8 @@ def interpolate_edge_timing(record: Record) -> Record:
 
 def read_held_share(record: Record) -> float:
     """Read the share of readings that were left out as held from the findings."""
-    said = [f.evidence["share"] for f in record.findings if f.code == "edge_timer"]
-    return sum(float(s or 0.0) for s in said)
+    shares = [f.evidence["share"] for f in record.findings if f.code == "edge_timer"]
+    return sum(float(s or 0.0) for s in shares)
 
 
 def _find_count_angle(record: Record, velocity: Array) -> float:
@@ -102,43 +102,43 @@ def _interpolate_speed(record: Record, velocity: Array, count: float) -> tuple[A
     longest = float(took[speed != 0].max(initial=0.0))
     for begin, end in itertools.pairwise((*record.starts, speed.size)):
         rows = slice(begin, end)
-        when, said, time = record.time[rows], speed[rows], took[rows]
-        before = np.append(np.nan, said[:-1])
+        when, reading, time = record.time[rows], speed[rows], took[rows]
+        before = np.append(np.nan, reading[:-1])
         # After a rest, or back over the same edge, that time is not one of a count.
-        fresh = (said * before > 0) & ((said != before) | (time < MIN_COUNT_ROWS * step))
+        fresh = (reading * before > 0) & ((reading != before) | (time < MIN_COUNT_ROWS * step))
         # The last edge was up to a row ago, or up to a count where that takes less.
         middle = when - 0.5 * (time + np.minimum(time, step))
         at, max_gap = np.flatnonzero(fresh), MAX_NEIGHBOUR_ROWS * step
-        out[rows] = _interpolate_rows(when, middle[at], said[at], max_gap)
-        close = _find_adjacent(middle[at], said[at], max_gap)
+        out[rows] = _interpolate_rows(when, middle[at], reading[at], max_gap)
+        close = _find_adjacent(middle[at], reading[at], max_gap)
         # Before a reversal or a rest the last edge may be longer ago than by that.
         own = at[1:-1][close[:-1] & close[1:] & (time[at[1:-1]] <= step)]
-        out[rows][own] = _extrapolate_readings(when, middle, said, own, at)
-        zero = (said == 0) & np.isfinite(velocity[rows])
+        out[rows][own] = _extrapolate_readings(when, middle, reading, own, at)
+        zero = (reading == 0) & np.isfinite(velocity[rows])
         out[rows][_find_rests(when, zero, 2 * longest + step)] = 0.0
     lost = np.isfinite(velocity) & ~np.isfinite(out)
     return out, float(lost.mean())
 
 
-def _find_adjacent(middle: Array, said: Array, max_gap: float) -> Flags:
+def _find_adjacent(middle: Array, reading: Array, max_gap: float) -> Flags:
     """Mark readings that closely follow one of the same sign."""
     apart = np.diff(middle)
-    return np.asarray((apart > 0) & (apart < max_gap) & (said[1:] * said[:-1] > 0))
+    return np.asarray((apart > 0) & (apart < max_gap) & (reading[1:] * reading[:-1] > 0))
 
 
 def _extrapolate_readings(
-    when: Array, middle: Array, said: Array, own: Integers, at: Integers
+    when: Array, middle: Array, reading: Array, own: Integers, at: Integers
 ) -> Array:
     """Extrapolate readings to their rows from the reading before.
 
     The voltage may change in a reading's own row, so later readings belong to another motion.
     """
     before = at[np.searchsorted(at, own) - 1]
-    slope = (said[own] - said[before]) / (middle[own] - middle[before])
-    return np.asarray(said[own] + (when[own] - middle[own]) * slope)
+    slope = (reading[own] - reading[before]) / (middle[own] - middle[before])
+    return np.asarray(reading[own] + (when[own] - middle[own]) * slope)
 
 
-def _interpolate_rows(when: Array, middle: Array, said: Array, max_gap: float) -> Array:
+def _interpolate_rows(when: Array, middle: Array, reading: Array, max_gap: float) -> Array:
     """Interpolate adjacent readings linearly at the rows; a lone one holds in its nearest row.
 
     There it is up to half a row off, in which a fast motor may reverse.
@@ -147,14 +147,14 @@ def _interpolate_rows(when: Array, middle: Array, said: Array, max_gap: float) -
     if middle.size < 2:
         return out
     middle = np.maximum.accumulate(middle)
-    close = _find_adjacent(middle, said, max_gap)
+    close = _find_adjacent(middle, reading, max_gap)
     alone = ~(np.append(close, False) | np.append(False, close)) & (middle >= when[0])
     row = np.interp(middle[alone], when, np.arange(when.size))
-    out[np.rint(row).astype(np.int64)] = said[alone]
+    out[np.rint(row).astype(np.int64)] = reading[alone]
     after = np.searchsorted(middle, when, side="right")
     inside = (after > 0) & (after < middle.size)
     inside[inside] = close[after[inside] - 1]
-    out[inside] = np.interp(when[inside], middle, said)
+    out[inside] = np.interp(when[inside], middle, reading)
     return out
 
 

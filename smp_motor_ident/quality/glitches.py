@@ -50,8 +50,8 @@ def remove_glitches(record: Record) -> Record:
 
 def count_glitches(record: Record, name: str) -> int:
     """Return the number of readings of a signal that were left out."""
-    said = [f.evidence for f in record.findings if f.code == "glitches"]
-    return sum(int(e["samples"] or 0) for e in said if e["signal"] == name)
+    evidence = [f.evidence for f in record.findings if f.code == "glitches"]
+    return sum(int(e["samples"] or 0) for e in evidence if e["signal"] == name)
 
 
 def _find_glitches(values: Array, pulsed: Flags) -> Flags:

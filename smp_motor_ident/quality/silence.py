@@ -48,7 +48,7 @@ def remove_silences(record: Record) -> Record:
         if rows.sum() < least:
             break
         begin, end = record.time[a], record.time[b]
-        said = Finding(
+        finding = Finding(
             "blocked",
             "warning",
             f"the {name} is constant from {begin:.4g} s to {end:.4g} s while the voltage would "
@@ -56,7 +56,7 @@ def remove_silences(record: Record) -> Record:
             {"signal": name, "begin": float(begin), "end": float(end)},
             "look for an obstacle of the motor, or for a loose cable of the encoder",
         )
-        record = replace(select_rows(record, rows), findings=(*record.findings, said))
+        record = replace(select_rows(record, rows), findings=(*record.findings, finding))
     return record
 
 

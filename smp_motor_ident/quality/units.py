@@ -112,8 +112,8 @@ def check_plausibility(
         "voltage (PWM, or a command in amperes, taken for volts?)"
     )
     if any(odd.values()):
-        said = f"no motor has {' and '.join(word for word, there in odd.items() if there)}"
-        yield Finding("implausible_motor", "warning", said, numbers, advice)
+        message = f"no motor has {' and '.join(word for word, there in odd.items() if there)}"
+        yield Finding("implausible_motor", "warning", message, numbers, advice)
     elif speed > MAX_USUAL_SPEED:
-        said = f"the motor has {words}; among brushed motors, only those of toys do"
-        yield Finding("fast_motor", "warning", said, numbers, advice)
+        message = f"the motor has {words}; among brushed motors, only those of toys do"
+        yield Finding("fast_motor", "warning", message, numbers, advice)

@@ -69,7 +69,7 @@ def results(
     changes: Sequence[Mapping[str, Any]],
 ) -> Results:
     """Return the drive, the gains as ``gains.json`` holds them, and the motors."""
-    groups = {"Motor": list(_motor(estimates))}
+    groups = {"Motor": list(_list_motor_rows(estimates))}
     if gains:
         entries = [gains[wheel] for wheel in estimates]
         driven = [[c for c in changes if c["wheel"] == wheel] for wheel in estimates]
@@ -77,23 +77,27 @@ def results(
             Row(name, unit, tuple(f"{one['gains'][name]:.4g}" for one in entries))
             for name, unit in GAINS
         ]
-        groups = {"Drive": list(_drive(entries, driven)), "Gains of wheel_pid": held, **groups}
+        groups = {
+            "Drive": list(_list_drive_rows(entries, driven)),
+            "Gains of wheel_pid": held,
+            **groups,
+        }
     return groups
 
 
-def _motor(estimates: Mapping[str, Estimate]) -> Iterator[Row]:
+def _list_motor_rows(estimates: Mapping[str, Estimate]) -> Iterator[Row]:
     """Return every number that the records tell, with random and systematic uncertainty."""
     held = [{**one.combinations, **one.parameters} for one in estimates.values()]
     for name in dict.fromkeys(name for one in held for name in one):
         found = [one.get(name, Quantity(None)) for one in held]
         known = [one for one in found if one.value is not None]
         if known:
-            unit = words.typeset(words.scaled(known[0]).unit)
+            unit = words.format_unit(words.scaled(known[0]).unit)
             values = tuple(words.state(one, with_unit=False) for one in found)
             yield Row(words.label(name), unit, values, tuple(map(words.systematic, found)))
 
 
-def _drive(
+def _list_drive_rows(
     entries: Sequence[Mapping[str, Any]], driven: Sequence[Sequence[Mapping[str, Any]]]
 ) -> Iterator[Row]:
     """Return settling and overshoot: designed, and the largest that were measured."""
@@ -103,20 +107,21 @@ def _drive(
     ):
         bands = [e["specification"][name] for e in entries]
         designed = (
-            f"{_figure(scale, b['value'])}, at most {_figure(scale, b['high'])}" for b in bands
+            f"{_format_figure(scale, b['value'])}, at most {_format_figure(scale, b['high'])}"
+            for b in bands
         )
         yield Row(f"{title}, designed", unit, tuple(designed))
         if name == "settling":
-            planned = (_figure(scale, e["settling"]["transition"]) for e in entries)
+            planned = (_format_figure(scale, e["settling"]["transition"]) for e in entries)
             yield Row("Planned transition, included", unit, tuple(planned))
         if all(driven):
             for key, of in (("allowed", "allowed in the drive"), ("reading", "driven")):
                 most = ([one[key][name] for one in changes] for changes in driven)
-                cells = (_figure(scale, None if None in m else max(m)) for m in most)
+                cells = (_format_figure(scale, None if None in m else max(m)) for m in most)
                 yield Row(f"{title}, {of}", unit, tuple(cells))
 
 
-def _figure(scale: float, value: float | None) -> str:
+def _format_figure(scale: float, value: float | None) -> str:
     return "—" if value is None else f"{round(scale * value, 2):.3g}"
 
 
@@ -128,7 +133,7 @@ def charts(changes: Sequence[Change]) -> list[Chart]:
         time = max((one.time for one in mine), key=len)
         curves = []
         for one in mine:
-            on = partial(_on, time, one.time)
+            on = partial(_resample, time, one.time)
             curves += [
                 Curve(f"{one.name}, predicted", on(one.nominal), "simulated", "line",
                       on(one.low), on(one.high)),
@@ -148,7 +153,7 @@ def charts(changes: Sequence[Change]) -> list[Chart]:
     return made
 
 
-def _on(time: Array, own: Array, values: Array) -> Array:
+def _resample(time: Array, own: Array, values: Array) -> Array:
     """Return a curve at other instants, NaN after its end."""
     return np.asarray(np.interp(time, own, values, right=np.nan))
 

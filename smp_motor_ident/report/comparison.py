@@ -82,5 +82,5 @@ def _place_on_axis(
         )
 
     marks = [(place(tick), f"{tick:g}") for tick in ticks(low, high, about=4)]
-    unit = words.typeset(next(iter(known)).unit)
+    unit = words.format_unit(next(iter(known)).unit)
     return Compared(words.label(name), [interval(wheel) for wheel in wheels], marks, unit)

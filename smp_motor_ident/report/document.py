@@ -45,7 +45,7 @@ def read_identification(path: Path) -> dict[str, Estimate]:
     if path.exists() and not path.is_file():
         raise BagError(f"{path}: is not a file; give a file that identify wrote")
     try:
-        document = _clean(msgspec.json.decode(path.read_bytes()))
+        document = _escape_texts(msgspec.json.decode(path.read_bytes()))
     except OSError as error:
         raise BagError(f"{path}: cannot be read ({error.strerror})") from None
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
@@ -60,21 +60,21 @@ def read_identification(path: Path) -> dict[str, Estimate]:
             raise BagError(
                 f"{path}: the wheel {wheel!r} has no ROS name; rename it: letters, digits, _"
             )
-    return {wheel: _motor(wheel, entry, path) for wheel, entry in motors.items()}
+    return {wheel: _read_motor(wheel, entry, path) for wheel, entry in motors.items()}
 
 
-def _clean(value: Any) -> Any:
+def _escape_texts(value: Any) -> Any:
     """Return a document's contents with line breaks in its texts replaced."""
     if isinstance(value, str):
         return printable(value)
     if isinstance(value, list):
-        return [_clean(inner) for inner in value]
+        return [_escape_texts(inner) for inner in value]
     if isinstance(value, dict):
-        return {key: _clean(inner) for key, inner in value.items()}
+        return {key: _escape_texts(inner) for key, inner in value.items()}
     return value
 
 
-def _motor(wheel: str, entry: Any, path: Path) -> Estimate:
+def _read_motor(wheel: str, entry: Any, path: Path) -> Estimate:
     """Return one motor of a document; its values are checked against the types of Estimate."""
     try:
         given = {k: v for k, v in msgspec.convert(entry, dict[str, Any]).items() if v is not None}
@@ -84,24 +84,24 @@ def _motor(wheel: str, entry: Any, path: Path) -> Estimate:
             given |= {"names": covariance["names"], "covariance": covariance.get("matrix", [])}
         for group in (given.get("parameters", {}), given.get("combinations", {})):
             for quantity in msgspec.convert(group, dict[str, dict[str, Any]]).values():
-                quantity["ci95"] = _interval(quantity.get("ci95"))
+                quantity["ci95"] = _read_interval(quantity.get("ci95"))
         estimate = msgspec.convert(
             given, Estimate, dec_hook=lambda _, rows: np.array(msgspec.convert(rows, Rows), float)
         )
-        _check(estimate)
+        _check_values(estimate)
         return estimate
     except (msgspec.ValidationError, ValueError) as error:
         raise BagError(f"{path}: is damaged ({wheel}: {error}); run identify again") from None
 
 
-def _interval(bounds: Any) -> Any:
+def _read_interval(bounds: Any) -> Any:
     """Return an interval whose missing ends, which JSON cannot say, are infinite."""
     if not isinstance(bounds, list) or len(bounds) != 2:
         return bounds
     return [end if one is None else one for one, end in zip(bounds, (-math.inf, math.inf))]
 
 
-def _check(estimate: Estimate) -> None:
+def _check_values(estimate: Estimate) -> None:
     """Raise an error for impossible values of the right type."""
     size = len(estimate.names)
     if estimate.covariance.shape != (size, size) or len(set(estimate.names)) != size:
@@ -124,7 +124,7 @@ def _check(estimate: Estimate) -> None:
             raise ValueError(f"{name} is {quantity.value}; it must be positive")
 
 
-def _known(quantity: Quantity | None) -> bool:
+def _is_known(quantity: Quantity | None) -> bool:
     return quantity is not None and quantity.value is not None and math.isfinite(quantity.value)
 
 
@@ -135,11 +135,11 @@ def motor_entry(estimate: Estimate) -> dict[str, float | int]:
     of the same response from voltage to speed.
     """
     parameters = estimate.parameters
-    physical = all(_known(parameters.get(name)) for name in PHYSICAL[:5])
+    physical = all(_is_known(parameters.get(name)) for name in PHYSICAL[:5])
     names = PHYSICAL if physical else COMBINATIONS
     held = parameters if physical else estimate.combinations
     entry: dict[str, float | int] = {
-        name: float(estimate.value(name)) for name in names if _known(held.get(name))
+        name: float(estimate.value(name)) for name in names if _is_known(held.get(name))
     }
     if estimate.value("delay") > 0:
         entry["delay"] = float(estimate.value("delay"))

@@ -89,7 +89,9 @@ def svg(chart: Chart) -> str:
     parts += plane.axes()
     for level in chart.lines:
         y = plane.y(np.array([level]))[0]
-        parts.append(_path(f"M{LEFT} {y:.1f}H{WIDTH - RIGHT}", "muted", 'stroke-dasharray="4 3"'))
+        parts.append(
+            _draw_path(f"M{LEFT} {y:.1f}H{WIDTH - RIGHT}", "muted", 'stroke-dasharray="4 3"')
+        )
     for curve in chart.curves:
         parts += plane.curve(curve)
     return "".join([*parts, "</svg>"])
@@ -119,7 +121,7 @@ def document(charts: Sequence[Chart], wheels: Sequence[str]) -> str:
     )
 
 
-def _path(way: str, color: str, more: str = "") -> str:
+def _draw_path(way: str, color: str, more: str = "") -> str:
     return f'<path d="{way}" fill="none" stroke="var(--{color})" {more}/>'
 
 
@@ -131,8 +133,8 @@ class _Plane:
         self.bottom = chart.height - BOTTOM
         values = [a for c in chart.curves for a in (c.y, c.low, c.high) if a is not None]
         values.append(np.array(chart.lines))
-        self._x_range = _range([chart.x], "x" in chart.log, 0.0)
-        self._y_range = _range(values, "y" in chart.log, 0.05)
+        self._x_range = _find_range([chart.x], "x" in chart.log, 0.0)
+        self._y_range = _find_range(values, "y" in chart.log, 0.05)
 
     def x(self, values: Array) -> Array:
         return _place(values, self._x_range, "x" in self.chart.log, LEFT, WIDTH - RIGHT)
@@ -144,16 +146,16 @@ class _Plane:
         parts = []
         for tick in ticks(*self._x_range, "x" in self.chart.log):
             x = self.x(np.array([tick]))[0]
-            parts.append(_path(f"M{x:.1f} {TOP}V{self.bottom}", "grid"))
-            parts.append(_text(x, self.bottom + 15, f"{tick:g}", "middle"))
+            parts.append(_draw_path(f"M{x:.1f} {TOP}V{self.bottom}", "grid"))
+            parts.append(_draw_text(x, self.bottom + 15, f"{tick:g}", "middle"))
         for tick in ticks(*self._y_range, "y" in self.chart.log, 5):
             y = self.y(np.array([tick]))[0]
-            parts.append(_path(f"M{LEFT} {y:.1f}H{WIDTH - RIGHT}", "grid"))
-            parts.append(_text(LEFT - 6, y + 4, f"{tick:g}", "end"))
+            parts.append(_draw_path(f"M{LEFT} {y:.1f}H{WIDTH - RIGHT}", "grid"))
+            parts.append(_draw_text(LEFT - 6, y + 4, f"{tick:g}", "end"))
         middle = (TOP + self.bottom) / 2
-        parts.append(_text((LEFT + WIDTH) / 2, self.bottom + 33, self.chart.x_label, "middle"))
+        parts.append(_draw_text((LEFT + WIDTH) / 2, self.bottom + 33, self.chart.x_label, "middle"))
         turned = f'transform="rotate(-90 14 {middle:.0f})"'
-        parts.append(_text(14, middle, self.chart.y_label, "middle", turned))
+        parts.append(_draw_text(14, middle, self.chart.y_label, "middle", turned))
         return parts
 
     def curve(self, curve: Curve) -> list[str]:
@@ -161,27 +163,27 @@ class _Plane:
         if curve.low is not None and curve.high is not None:
             ok = np.isfinite(curve.low) & np.isfinite(curve.high)
             x, high, low = self.x(self.chart.x[ok]), self.y(curve.high[ok]), self.y(curve.low[ok])
-            way = _polyline(np.concatenate((x, x[::-1])), np.concatenate((high, low[::-1])))
+            way = _draw_polyline(np.concatenate((x, x[::-1])), np.concatenate((high, low[::-1])))
             parts.append(f'<path d="{way}" fill="var(--{curve.color})" fill-opacity=".2"/>')
         keep = thin(curve.y, POINTS)
         x, y = self.x(self.chart.x[keep]), self.y(curve.y[keep])
         if curve.kind == "line":
             behind = ' stroke-opacity=".5"' if curve.width > 2 else ""
             look = f'stroke-width="{curve.width:g}"{behind}'
-            parts.append(_path(_polyline(x, y), curve.color, look))
+            parts.append(_draw_path(_draw_polyline(x, y), curve.color, look))
             return parts
         ok = np.isfinite(y)
         if curve.kind == "bars":
             zero = self.y(np.zeros(1))[0]
             way = "".join(f"M{a:.1f} {zero:.1f}V{b:.1f}" for a, b in zip(x[ok], y[ok]))
-            parts.append(_path(way, curve.color, 'stroke-width="3"'))
+            parts.append(_draw_path(way, curve.color, 'stroke-width="3"'))
         else:
             way = "".join(f"M{a:.1f} {b:.1f}h0" for a, b in zip(x[ok], y[ok]))
-            parts.append(_path(way, curve.color, 'stroke-width="5" stroke-linecap="round"'))
+            parts.append(_draw_path(way, curve.color, 'stroke-width="5" stroke-linecap="round"'))
         return parts
 
 
-def _range(values: Sequence[Array], log: bool, margin: float) -> tuple[float, float]:
+def _find_range(values: Sequence[Array], log: bool, margin: float) -> tuple[float, float]:
     everything = np.concatenate([np.ravel(v) for v in values])
     everything = everything[np.isfinite(everything) & ((everything > 0) | (not log))]
     if everything.size == 0:
@@ -216,7 +218,7 @@ def ticks(low: float, high: float, log: bool = False, about: int = 8) -> list[fl
     return [round(k * step, 12) for k in range(first, last + 1)]
 
 
-def _polyline(x: Array, y: Array) -> str:
+def _draw_polyline(x: Array, y: Array) -> str:
     """Return a path that is interrupted where there is no value."""
     way, down = [], False
     for a, b in zip(x.tolist(), y.tolist()):
@@ -228,7 +230,7 @@ def _polyline(x: Array, y: Array) -> str:
     return "".join(way)
 
 
-def _text(x: float, y: float, text: str, anchor: str, more: str = "") -> str:
+def _draw_text(x: float, y: float, text: str, anchor: str, more: str = "") -> str:
     return (
         f'<text x="{x:.1f}" y="{y:.1f}" text-anchor="{anchor}" font-size="11" '
         f'fill="var(--muted)" {more}>{escape(text)}</text>'

@@ -49,7 +49,7 @@ def fit_charts(wheel: str, parts: Sequence[Comparison], lag: float = 0.0) -> lis
     simulated = np.concatenate([part.simulated for part in parts])
     voltage = np.concatenate([part.voltage for part in parts])
     keep = np.union1d(thin(measured, MAX_POINTS // 2), thin(simulated, MAX_POINTS // 2))
-    name, view = label(wheel), _liveliest(time, measured, spans, VIEW_LAGS * lag)
+    name, view = label(wheel), _find_liveliest(time, measured, spans, VIEW_LAGS * lag)
 
     def chart(kind: str, y_label: str, height: int, *curves: Curve) -> Chart:
         return Chart(
@@ -70,7 +70,7 @@ def fit_charts(wheel: str, parts: Sequence[Comparison], lag: float = 0.0) -> lis
     ]
 
 
-def _liveliest(
+def _find_liveliest(
     time: Array, speed: Array, spans: Sequence[tuple[float, float, Role]], length: float
 ) -> tuple[float, float] | None:
     """Return the stretch of held-out data, else of any, in which the speed scatters most."""
@@ -117,7 +117,7 @@ def frequency_charts(wheel: str, parts: Sequence[Comparison]) -> list[Chart]:
     Both are estimated in the same way from the same voltage, so that friction, the hold and the
     sampling act on both alike; where they part beyond the band, the model misses something.
     """
-    found = _response(parts)
+    found = _estimate_response(parts)
     if found is None:
         return []
     frequency, measured, simulated, spread = found
@@ -144,7 +144,7 @@ def frequency_charts(wheel: str, parts: Sequence[Comparison]) -> list[Chart]:
     return charts
 
 
-def _without_pauses(part: Comparison, step: float) -> list[tuple[Array, ...]]:
+def _split_at_pauses(part: Comparison, step: float) -> list[tuple[Array, ...]]:
     """Return time, voltage, measured and simulated speed of the pieces between pauses."""
     known = np.isfinite(part.measured) & np.isfinite(part.simulated)
     whole = (part.time, part.voltage, part.measured, part.simulated)
@@ -153,7 +153,7 @@ def _without_pauses(part: Comparison, step: float) -> list[tuple[Array, ...]]:
     return [*zip(*(np.split(column, begins) for column in columns))] if known.any() else []
 
 
-def _response(parts: Sequence[Comparison]) -> tuple[Array, Array, Array, Array] | None:
+def _estimate_response(parts: Sequence[Comparison]) -> tuple[Array, Array, Array, Array] | None:
     """Return frequencies, response of data and model, and 95 % of the log of the former.
 
     References
@@ -162,7 +162,7 @@ def _response(parts: Sequence[Comparison]) -> tuple[Array, Array, Array, Array] 
     a response with coherence g over n averages is ``sqrt((1 - g) / (2 n g))``.
     """
     step = float(np.median(np.diff(max(parts, key=lambda part: part.time.size).time)))
-    pieces = [piece for part in parts for piece in _without_pauses(part, step)]
+    pieces = [piece for part in parts for piece in _split_at_pauses(part, step)]
     longest = max((time.size for time, *_ in pieces), default=0)
     size = int(2 ** np.floor(np.log2(max(longest / 4, 1))))
     if size < 64 or step <= 0:

@@ -50,7 +50,7 @@ class Mark:
 
 def name_motor(row: Row | Mark) -> str:
     """Return whose motor it is."""
-    return f"{row.robot}, {words.put_within(row.wheel)}" if row.wheel else row.robot
+    return f"{row.robot}, {words.label_in_sentence(row.wheel)}" if row.wheel else row.robot
 
 
 def drifts(rows: Sequence[Row]) -> list[Mark]:
@@ -61,9 +61,9 @@ def drifts(rows: Sequence[Row]) -> list[Mark]:
     """
     marks = []
     dated = [row for row in rows if row.date is not None]
-    for (robot, wheel, name), held in _grouped(dated, lambda r: r.robot).items():
+    for (robot, wheel, name), held in _group_rows(dated, lambda r: r.robot).items():
         day = np.array([(r.date or 0.0) / DAY for r in held])
-        value, std = _numbers(held, name)
+        value, std = _read_values(held, name)
         if len(held) < 3 or np.ptp(day) == 0 or not np.all(std > 0):
             continue
         middle = np.average(day, weights=std**-2.0)  # there the line is at the mean
@@ -81,7 +81,7 @@ def drifts(rows: Sequence[Row]) -> list[Mark]:
     return marks
 
 
-def _numbers(rows: Sequence[Row], name: str) -> tuple[Array, Array]:
+def _read_values(rows: Sequence[Row], name: str) -> tuple[Array, Array]:
     """Return the values of a quantity and their standard deviations."""
     pairs = [(r.values[name].value, r.values[name].std or 0.0) for r in rows]
     value, std = np.array(pairs, dtype=np.float64).T
@@ -95,11 +95,11 @@ def outliers(rows: Sequence[Row]) -> list[Mark]:
     (1.4826 times the median deviation, but at least the value's own standard deviation).
     """
     marks = []
-    for (_, wheel, name), held in _grouped(rows, lambda r: "").items():
+    for (_, wheel, name), held in _group_rows(rows, lambda r: "").items():
         last = list({r.robot: r for r in sorted(held, key=lambda r: r.date or 0.0)}.values())
         if len(last) < MIN_FLEET_SIZE:
             continue
-        value, std = _numbers(last, name)
+        value, std = _read_values(last, name)
         middle = float(np.median(value))
         spread = np.hypot(1.4826 * np.median(np.abs(value - middle)), std)
         for row, one, wide in zip(last, value, spread, strict=True):
@@ -113,7 +113,7 @@ def outliers(rows: Sequence[Row]) -> list[Mark]:
     return marks
 
 
-def _grouped(
+def _group_rows(
     rows: Sequence[Row], robot_of: Callable[[Row], str]
 ) -> dict[tuple[str, str, str], list[Row]]:
     found: dict[tuple[str, str, str], list[Row]] = defaultdict(list)
@@ -161,7 +161,7 @@ def describe(row: Row) -> str:
     """Return what came out for one motor in one recording, in a line."""
     if row.failure:
         return row.failure
-    numbers = (f"{words.put_within(n)} {words.state(q)}" for n, q in row.values.items())
+    numbers = (f"{words.label_in_sentence(n)} {words.state(q)}" for n, q in row.values.items())
     fit = [] if row.fit_percent is None else [f"fit {row.fit_percent:.1f} %"]
     text = ", ".join([*numbers, *fit, *(["unreliable"] if row.unreliable else [])])
     return f"{row.robot}/{row.source}: {row.wheel}: {text}"
@@ -180,7 +180,7 @@ def page(rows: Sequence[Row], marks: Sequence[Mark]) -> str:
         "fleet.html.jinja",
         rows=sorted(rows, key=lambda r: (r.robot, r.wheel, r.date or 0.0)),
         marks=marks,
-        quantities={name: f"{words.label(name)} [{words.typeset(units[name])}]" for name in known},
+        quantities={n: f"{words.label(n)} [{words.format_unit(units[n])}]" for n in known},
         robots=len({r.robot for r in rows}),
         motors=len({(r.robot, r.wheel) for r in rows if r.wheel}),
         recordings=count(lambda r: True),

@@ -38,7 +38,9 @@ class Report:
 
 def render(report: Report) -> str:
     """Return the page."""
-    motors = {wheel: _motor(estimate, report) for wheel, estimate in report.estimates.items()}
+    motors = {
+        wheel: _describe_motor(estimate, report) for wheel, estimate in report.estimates.items()
+    }
     tuning_charts, tuning_data = list[Chart](), dict[str, Any]()
     if report.tunings:
         from smp_motor_ident.report import tuning_page  # loads all of tune, which few reports need
@@ -59,7 +61,7 @@ def render(report: Report) -> str:
     )
 
 
-def _motor(estimate: Estimate, report: Report) -> dict[str, Any]:
+def _describe_motor(estimate: Estimate, report: Report) -> dict[str, Any]:
     """Return the template's data for one motor, in the order of a reader's questions."""
     wheel = estimate.wheel
     parts, since = report.comparisons.get(wheel, ()), report.history.get(wheel, ())
@@ -75,11 +77,13 @@ def _motor(estimate: Estimate, report: Report) -> dict[str, Any]:
         "grade": grade,
         "verdict": verdict,
         "fit_percent": summary.describe_fit(estimate),
-        "rows": [_row(n, q, doubted.get(n)) for n, q in held.items() if words.is_told(q)],
-        "hidden": [words.put_within(n) for n, q in held.items() if not words.is_told(q)],
+        "rows": [
+            _describe_quantity(n, q, doubted.get(n)) for n, q in held.items() if words.is_stated(q)
+        ],
+        "hidden": [words.label_in_sentence(n) for n, q in held.items() if not words.is_stated(q)],
         "messages": shown,
         "other": other,
-        "gains": _gains(estimate, report),
+        "gains": _describe_gains(estimate, report),
         "chain": _list_components(estimate),
         "charts": [*fit, *residuals, *frequency, *since],
         "history": since,
@@ -97,7 +101,7 @@ def _list_components(estimate: Estimate) -> list[str]:
     ]
 
 
-def _gains(estimate: Estimate, report: Report) -> tuple[str, str]:
+def _describe_gains(estimate: Estimate, report: Report) -> tuple[str, str]:
     """Return the gains of a tuning in words, or how to get them and the command that does it."""
     tuning = report.tunings.get(estimate.wheel)
     if tuning is None:
@@ -109,7 +113,7 @@ def _gains(estimate: Estimate, report: Report) -> tuple[str, str]:
     return f"Gains of wheel_pid, in volts and rad/s of the wheel: {gains}; parameter file:", ""
 
 
-def _row(name: str, quantity: Quantity, doubt: int | None) -> dict[str, Any]:
+def _describe_quantity(name: str, quantity: Quantity, doubt: int | None) -> dict[str, Any]:
     """Return one line of a table of quantities, in words; ``doubt`` is the message against it."""
     _, symbol, title, meaning = QUANTITIES.get(name, ("", "", words.label(name), ""))
     return dict(

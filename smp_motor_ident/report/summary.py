@@ -5,7 +5,7 @@ import shlex
 from dataclasses import dataclass
 
 from smp_motor_ident.finding import SEVERITIES, Finding
-from smp_motor_ident.report.words import is_told, put_within, to_sentence
+from smp_motor_ident.report.words import is_stated, label_in_sentence, to_sentence
 from smp_motor_ident.result import Estimate, Quantity
 
 MAX_MESSAGES = 3  # so many are shown of a motor without being asked for; more are not read
@@ -35,15 +35,15 @@ def _by_severity(estimate: Estimate) -> list[Finding]:
     return sorted(estimate.findings, key=lambda f: -SEVERITIES.index(f.severity))
 
 
-def _told(estimate: Estimate) -> list[str]:
+def _list_stated(estimate: Estimate) -> list[str]:
     """Return the names of all numbers, and ranges that are left open, of a motor."""
     every = {**estimate.combinations, **estimate.parameters}
-    return [name for name, quantity in every.items() if is_told(quantity)]
+    return [name for name, quantity in every.items() if is_stated(quantity)]
 
 
 def find_doubted(estimate: Estimate) -> dict[str, int]:
     """Return the quantities that may be off by more than is stated, each with its message."""
-    doubted, known = dict[str, int](), _told(estimate)
+    doubted, known = dict[str, int](), _list_stated(estimate)
     for number, finding in enumerate(_by_severity(estimate), 1):
         if finding.severity in ("unreliable", "refused"):
             # One that names no quantity concerns all.
@@ -57,8 +57,8 @@ def judge(estimate: Estimate) -> tuple[str, str]:
     percent = estimate.fit_percent.validation
     if estimate.unreliable:
         doubted = find_doubted(estimate)
-        every = len(doubted) == len(_told(estimate))
-        which = "every number" if every else ", ".join(map(put_within, doubted))
+        every = len(doubted) == len(_list_stated(estimate))
+        which = "every number" if every else ", ".join(map(label_in_sentence, doubted))
         return "poor", f"Unreliable: {which}"
     warnings = sum(f.severity == "warning" for f in estimate.findings)
     if warnings:

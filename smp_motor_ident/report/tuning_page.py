@@ -63,7 +63,7 @@ class Tuning:
     reason: str = ""  # why there is no design at all
 
 
-def designs_of(
+def design_all_wheels(
     estimates: Mapping[str, Estimate], loops: Mapping[str, Loop]
 ) -> tuple[Mapping[str, Design], dict[str, Tuning]]:
     """Return the designs of ``tune``, all wheels together, and the wheels that have none."""
@@ -72,11 +72,15 @@ def designs_of(
         try:
             return design_wheels(left, loops).designs, refused
         except SmpError as error:
-            refused |= _refused(left, loops) or {w: Tuning(w, reason=str(error)) for w in left}
+            refused |= _explain_refusals(left, loops) or {
+                w: Tuning(w, reason=str(error)) for w in left
+            }
     return {}, refused
 
 
-def _refused(estimates: Mapping[str, Estimate], loops: Mapping[str, Loop]) -> dict[str, Tuning]:
+def _explain_refusals(
+    estimates: Mapping[str, Estimate], loops: Mapping[str, Loop]
+) -> dict[str, Tuning]:
     """Return the wheels for which there is no design at all, with the reason."""
     found = {}
     for wheel, estimate in estimates.items():
@@ -87,7 +91,7 @@ def _refused(estimates: Mapping[str, Estimate], loops: Mapping[str, Loop]) -> di
     return found
 
 
-def tuning_of(estimate: Estimate, loop: Loop, own: Design) -> Tuning:
+def design_tuning(estimate: Estimate, loop: Loop, own: Design) -> Tuning:
     """Design one wheel's controller at every place of the sliders, around that of ``tune``."""
     choices = [
         Choice(share * own.margins.crossover, margin, own, curves(estimate, own))
@@ -108,7 +112,7 @@ def tuning_of(estimate: Estimate, loop: Loop, own: Design) -> Tuning:
 def choose(estimate: Estimate, loop: Loop, bandwidth: float, margin: float, own: Design) -> Choice:
     """Design for a bandwidth [rad/s] and a phase margin [deg], at the pace of ``own``."""
     asked = dict(bandwidth=bandwidth, phase_margin=margin)
-    return _choice(estimate, loop, Choice(bandwidth, margin), own, asked, solve)
+    return _finish_choice(estimate, loop, Choice(bandwidth, margin), own, asked, solve)
 
 
 def judge(estimate: Estimate, own: Design, feedback: Feedback) -> Choice:
@@ -117,10 +121,10 @@ def judge(estimate: Estimate, own: Design, feedback: Feedback) -> Choice:
     def given(case: Case) -> tuple[Feedback, float, Robustness]:
         return assess(case, feedback)
 
-    return _choice(estimate, own.loop, Choice(math.nan, math.nan), own, {}, given)
+    return _finish_choice(estimate, own.loop, Choice(math.nan, math.nan), own, {}, given)
 
 
-def _choice(
+def _finish_choice(
     estimate: Estimate, loop: Loop, asked: Choice, own: Design, targets: Mapping[str, Any],
     solve_case: Callable[[Case], tuple[Feedback, float, Robustness]],
 ) -> Choice:  # fmt: skip
@@ -169,7 +173,7 @@ def describe(one: Choice) -> dict[str, Any]:
     ]
     return {
         **asked,
-        "rows": _rows(found),
+        "rows": _list_figures(found),
         "yaml": writing.gains_yaml({found.wheel: found}, head),
         "charts": {
             chart.name: [
@@ -181,16 +185,16 @@ def describe(one: Choice) -> dict[str, Any]:
     }
 
 
-def _rows(found: Design) -> list[tuple[str, str, str]]:
+def _list_figures(found: Design) -> list[tuple[str, str, str]]:
     """Return name, value and band of the design's figures."""
     bands, gains, settling = found.specification, found.gains, found.settling
     return [
         ("Crossover", f"{found.margins.crossover:.4g} rad/s", ""),
-        ("Phase margin", *_banded(bands.phase_margin, 1.0, "°")),
-        ("Gain margin", *_banded(bands.gain_margin, 1.0, "")),
-        ("Largest sensitivity Ms", *_banded(bands.sensitivity, 1.0, "")),
-        ("Overshoot", *_banded(bands.overshoot, 1.0, " %")),
-        ("Settling within 2 % of a planned change", *_banded(bands.settling, 1e3, " ms")),
+        ("Phase margin", *_format_band(bands.phase_margin, 1.0, "°")),
+        ("Gain margin", *_format_band(bands.gain_margin, 1.0, "")),
+        ("Largest sensitivity Ms", *_format_band(bands.sensitivity, 1.0, "")),
+        ("Overshoot", *_format_band(bands.overshoot, 1.0, " %")),
+        ("Settling within 2 % of a planned change", *_format_band(bands.settling, 1e3, " ms")),
         (
             f"Duration of a planned change by {settling.change:.3g} rad/s"
             f"{', the same for all wheels' if settling.common else ''}",
@@ -205,7 +209,7 @@ def _rows(found: Design) -> list[tuple[str, str, str]]:
     ]
 
 
-def _banded(band: specification.Band, scale: float, unit: str) -> tuple[str, str]:
+def _format_band(band: specification.Band, scale: float, unit: str) -> tuple[str, str]:
     value, low, high = (f"{round(scale * v, 3):.3g}" for v in (band.value, band.low, band.high))
     return f"{value}{unit}", f"{low} … {high}{unit}"
 
@@ -223,7 +227,7 @@ def tuning_charts(wheels: Mapping[str, Curves], limit: float, prefix: str = "") 
         timed = kind in ("step", "load")
         x = time if timed else omega
         bands = {
-            wheel: _on(x, c.time if timed else c.omega, getattr(c, kind))
+            wheel: _resample(x, c.time if timed else c.omega, getattr(c, kind))
             for wheel, c in wheels.items()
         }
         curves = tuple(
@@ -231,7 +235,7 @@ def tuning_charts(wheels: Mapping[str, Curves], limit: float, prefix: str = "") 
             for k, (wheel, rows) in enumerate(bands.items())
         )
         if kind == "step":
-            curves += (Curve("reference", _on(x, longest.time, longest.reference), "muted"),)
+            curves += (Curve("reference", _resample(x, longest.time, longest.reference), "muted"),)
         return Chart(
             name=prefix + kind, title=title, y_label=y_label, log=log, lines=lines, curves=curves,
             x_label="time [ms]" if timed else "frequency [rad/s]",
@@ -249,7 +253,7 @@ def tuning_charts(wheels: Mapping[str, Curves], limit: float, prefix: str = "") 
     ]
 
 
-def _on(x: Array, own: Array, rows: Array) -> Array:
+def _resample(x: Array, own: Array, rows: Array) -> Array:
     """Return curves on another axis, shape (..., x.size); NaN outside of their own."""
     flatten = [np.interp(x, own, row, left=np.nan, right=np.nan) for row in np.atleast_2d(rows)]
     return np.array(flatten).reshape(*rows.shape[:-1], x.size)

@@ -46,7 +46,7 @@ def label(name: str) -> str:
     return name.replace("_", " ").strip().capitalize()
 
 
-def put_within(name: str) -> str:
+def label_in_sentence(name: str) -> str:
     """Return a quantity as it is written within a sentence."""
     text = label(name)
     proper = text[:2].isupper() or text.startswith("Coulomb")
@@ -63,11 +63,11 @@ def spread(std: float | None) -> str:
     if std is None or not math.isfinite(std):
         return "—"
     if std == 0 or 1e-4 <= std < 1e3:
-        return _two_digits(std)
+        return _format_two_digits(std)
     return f"{std:.1e}"
 
 
-def _two_digits(value: float) -> str:
+def _format_two_digits(value: float) -> str:
     return f"{float(f'{value:.2g}'):g}"
 
 
@@ -79,8 +79,8 @@ def state(quantity: Quantity, with_unit: bool = True) -> str:
     elif not shown.std:
         text = f"{shown.value:.6g}"
     else:
-        text = _written(" ± ", (shown.value, shown.std), shown)
-    return _with_unit(text, shown.unit) if with_unit and is_told(quantity) else text
+        text = _format_numbers(" ± ", (shown.value, shown.std), shown)
+    return _append_unit(text, shown.unit) if with_unit and is_stated(quantity) else text
 
 
 def interval(quantity: Quantity) -> str:
@@ -89,34 +89,34 @@ def interval(quantity: Quantity) -> str:
     if shown.ci95 is None:
         return "—"
     if shown.value is None or not shown.std:
-        return " … ".join(map(_rounded, shown.ci95))
-    return _written(" … ", shown.ci95, shown)
+        return " … ".join(map(_format_end, shown.ci95))
+    return _format_numbers(" … ", shown.ci95, shown)
 
 
-def _written(between: str, values: Sequence[float], of: Quantity) -> str:
+def _format_numbers(between: str, values: Sequence[float], of: Quantity) -> str:
     """Return numbers with the decimals of a deviation's two digits, and their power of ten."""
     std, size = of.std or 0.0, max(abs(of.value or 0.0), of.std or 0.0)
     power = 0 if 1e-3 <= size < 1e6 else math.floor(math.log10(size))
     places = 1 - math.floor(math.log10(float(f"{std:.1e}"))) + power
     places = min(places, MAX_DIGITS - 1 - math.floor(math.log10(size)) + power)
-    text = between.join(_fixed(value / 10.0**power, places) for value in values)
+    text = between.join(_format_fixed(value / 10.0**power, places) for value in values)
     superscript = str(power).translate(str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹"))
     return f"({text})·10{superscript}" if power else text
 
 
-def _fixed(value: float, places: int) -> str:
+def _format_fixed(value: float, places: int) -> str:
     """Return a number with so many decimals; a deviation too small for them with an exponent."""
     rounded = round(value, places)
     return f"{rounded:.{max(places, 0)}f}" if rounded or not value else f"{value:.1e}"
 
 
-def _rounded(end: float) -> str:
+def _format_end(end: float) -> str:
     """Return the end of a range with three digits."""
     return "∞" if math.isinf(end) else f"{end:.0f}" if 100 <= abs(end) < 1e6 else f"{end:.3g}"
 
 
-def _with_unit(text: str, unit: str) -> str:
-    return text if unit in ("", "1") else f"{text} {typeset(unit)}"
+def _append_unit(text: str, unit: str) -> str:
+    return text if unit in ("", "1") else f"{text} {format_unit(unit)}"
 
 
 def systematic(quantity: Quantity) -> str:
@@ -124,8 +124,8 @@ def systematic(quantity: Quantity) -> str:
     shown = scaled(quantity)
     words = []
     for one in shown.systematic:
-        unit = _with_unit(spread(one.size), shown.unit)
-        size = f"{_two_digits(100 * one.share)} %" if one.share is not None else unit
+        unit = _append_unit(spread(one.size), shown.unit)
+        size = f"{_format_two_digits(100 * one.share)} %" if one.share is not None else unit
         words.append(f"± {size} ({cause(one.cause)})")
     volts = (quantity.valid or {}).get("voltage")
     return ", ".join([*words, *([f"seen at ±{volts[1]:.3g} V only"] if volts else [])])
@@ -136,7 +136,7 @@ def cause(name: str) -> str:
     return CAUSES.get(name, name.replace("_", " "))
 
 
-def typeset(unit: str) -> str:
+def format_unit(unit: str) -> str:
     """Return a unit as one prints it."""
     return unit.replace("^2", "²").replace("ohm", "Ω")
 
@@ -155,7 +155,7 @@ def date(seconds: float) -> str:
     return datetime.fromtimestamp(seconds, timezone.utc).strftime("%Y-%m-%d %H:%M UTC")
 
 
-def is_told(quantity: Quantity) -> bool:
+def is_stated(quantity: Quantity) -> bool:
     """Return whether there is a number or a range to state."""
     return quantity.value is not None or quantity.ci95 is not None
 
@@ -171,7 +171,7 @@ def to_sentence(text: str) -> str:
     known = {**QUANTITIES, **MODELS}
     text = re.sub(
         r"\b[a-z]+(_[a-z]+)+\b(?!=)",
-        lambda m: put_within(m[0]) if m[0] in known else m[0],
+        lambda m: label_in_sentence(m[0]) if m[0] in known else m[0],
         text.strip(),
     )
     text = re.sub(r"^[a-z]+(?=[ ,;])", lambda m: m[0].capitalize(), text)

@@ -23,13 +23,13 @@ from smp_motor_ident.tune.methods import METHODS
 from smp_motor_ident.tune.motors import (
     Friction,
     alternate_motors,
+    bound_friction,
+    compute_outlier_share,
+    compute_torque_noise,
     draw_motors,
-    friction_of,
-    motors_of,
+    make_motors,
     move_lag_to_sensor,
-    outliers_of,
     report_sensor_lag,
-    torque_noise_of,
     unreliable_spread,
 )
 from smp_motor_ident.tune.plant import sample
@@ -72,7 +72,7 @@ class Case:
     findings: tuple[Finding, ...]  # about the estimate
 
     @property
-    def swallowed(self) -> float:
+    def lost_voltage(self) -> float:
         """Voltage [V] that is surely lost before the motor turns, which feed-forward adds."""
         return self.friction.known + self.driver.threshold
 
@@ -88,7 +88,7 @@ class Case:
 
 def prepare(estimate: Estimate, loop: Loop, method: str, targets: dict[str, Any]) -> Case:
     """Sample the motor and the draws of its distribution; see :func:`design`."""
-    chosen = _method(method, targets)
+    chosen = _check_method(method, targets)
     findings = list(_check_reliability(estimate, bool(targets.get("accept_unreliable"))))
     driver = make_driver(
         rebuild_chain(estimate.chain),
@@ -96,14 +96,14 @@ def prepare(estimate: Estimate, loop: Loop, method: str, targets: dict[str, Any]
         estimate.hardware.supply_voltage or 0.0,
     )
     loop = _limit_by_driver(driver, loop)
-    friction = friction_of(estimate, loop.supply_voltage)
+    friction = bound_friction(estimate, loop.supply_voltage)
     lag = report_sensor_lag(estimate) if loop.reports_speed else None
     level = next((f for f in estimate.findings if f.code == "one_size_of_voltage"), None)
     findings += [one for one in (friction.finding, lag, level) if one is not None]
     # The reference leaves room for all of it.
     load = abs(estimate.value("load_voltage"))
     lost = friction.planned + driver.threshold + load
-    plant = sample(replace(motors_of(estimate), static_voltage=np.array([lost])), loop)
+    plant = sample(replace(make_motors(estimate), static_voltage=np.array([lost])), loop)
     problem = Problem(plant, loop, targets, unmodelled_dynamics(estimate))
     required = replace(
         chosen.required,
@@ -134,10 +134,10 @@ def prepare(estimate: Estimate, loop: Loop, method: str, targets: dict[str, Any]
         friction,
         driver,
         load,
-        torque_noise_of(estimate, loop.sample_time),
+        compute_torque_noise(estimate, loop.sample_time),
         estimate.evidence("arrival_beat", "latency"),
         abs(estimate.chain.values.get("eccentricity", 0.0)),
-        outliers_of(estimate) if loop.reports_speed else 0.0,
+        compute_outlier_share(estimate) if loop.reports_speed else 0.0,
         lag is not None,
         tuple(findings),
     )
@@ -175,7 +175,7 @@ def _check_reliability(estimate: Estimate, accepted: bool) -> tuple[Finding, ...
 def solve(case: Case) -> tuple[Feedback, float, Robustness]:
     """Find the feedback gains, reduced as the uncertainty requires."""
     ruled = case.method.solve(case.problem)
-    quiet, calm = _within_clamp(case.problem, ruled)
+    quiet, calm = _reduce_noise(case.problem, ruled)
     feedback, factor, robustness = back_off(case.ensemble.assess, quiet)
     factor *= calm
     if factor == 0.0:
@@ -201,7 +201,7 @@ def assess(case: Case, feedback: Feedback) -> tuple[Feedback, float, Robustness]
     return feedback, 1.0, robustness
 
 
-def _within_clamp(problem: Problem, feedback: Feedback) -> tuple[Feedback, float]:
+def _reduce_noise(problem: Problem, feedback: Feedback) -> tuple[Feedback, float]:
     """Reduce gains until the control noise fits within the clamp."""
     factor, trial = 1.0, feedback
     while (
@@ -213,7 +213,7 @@ def _within_clamp(problem: Problem, feedback: Feedback) -> tuple[Feedback, float
     return trial, factor
 
 
-def _method(name: str, targets: dict[str, Any]) -> Method:
+def _check_method(name: str, targets: dict[str, Any]) -> Method:
     if name not in METHODS:
         raise DesignError(f"method is {name!r}; it must be one of {', '.join(METHODS)}")
     known = (*METHODS[name].targets, *COMMON_TARGETS)

@@ -10,7 +10,7 @@ from smp_motor_control.arrays import Array
 from smp_motor_ident.result import Estimate
 from smp_motor_ident.tune.designer import Design
 from smp_motor_ident.tune.margins import frequencies
-from smp_motor_ident.tune.motors import draw_motors, motors_of
+from smp_motor_ident.tune.motors import draw_motors, make_motors
 from smp_motor_ident.tune.plant import sample
 from smp_motor_ident.tune.problem import noise_density
 from smp_motor_ident.tune.reference import STEP_SHARE, controller_for, planned_change
@@ -40,7 +40,7 @@ class Curves:
 def curves(estimate: Estimate, design: Design) -> Curves:
     """Compute the curves of a design over the distribution of its estimate."""
     loop, ratio = design.loop, design.loop.gear_ratio
-    nominal = motors_of(estimate)
+    nominal = make_motors(estimate)
     drawn = draw_motors(estimate, DRAWS, np.random.default_rng(0))
     plant = sample(nominal if drawn is None else drawn, loop, believed=nominal)
     controller = controller_for(loop, design.feedback)
@@ -65,16 +65,16 @@ def curves(estimate: Estimate, design: Design) -> Curves:
     return Curves(
         time=time[shown],
         reference=planned.reference[shown] / ratio,
-        step=_band(step[:, shown]) / ratio,
-        load=_band(pushed.speed[:, shown]) / ratio,
+        step=_compute_band(step[:, shown]) / ratio,
+        load=_compute_band(pushed.speed[:, shown]) / ratio,
         omega=omega,
-        gain=_band(np.abs(loop_gain)),
-        phase=_band(np.rad2deg(np.unwrap(np.angle(loop_gain), axis=1))),
-        sensitivity=_band(np.abs(1 / (1 + loop_gain))),
-        noise=_band(through * np.sqrt(noise_density(plant, loop, omega))),
+        gain=_compute_band(np.abs(loop_gain)),
+        phase=_compute_band(np.rad2deg(np.unwrap(np.angle(loop_gain), axis=1))),
+        sensitivity=_compute_band(np.abs(1 / (1 + loop_gain))),
+        noise=_compute_band(through * np.sqrt(noise_density(plant, loop, omega))),
     )
 
 
-def _band(values: Array) -> Array:
+def _compute_band(values: Array) -> Array:
     band: Array = np.quantile(values, QUANTILES, axis=0)
     return band

@@ -29,8 +29,8 @@ from smp_motor_ident.tune.motors import Motors, move_lag_to_sensor
 from smp_motor_ident.tune.plant import Plant, sample
 from smp_motor_ident.tune.reference import Reference, controller_for, plan_reference
 from smp_motor_ident.tune.simulation import Controller
-from smp_motor_ident.tune.specification import Performance, Settling, Specification, figures_of
-from smp_motor_ident.tune.unmodelled import describe_known_band as known_words
+from smp_motor_ident.tune.specification import Performance, Settling, Specification, compute_figures
+from smp_motor_ident.tune.unmodelled import describe_known_band
 
 
 @dataclass(frozen=True)
@@ -126,8 +126,8 @@ def finish(
     problem, plant, loop = case.problem, case.problem.plant, case.problem.loop
     controller = controller_for(loop, feedback)
     margins = loop_margins(plant, feedback)
-    quickest = _plan(case, controller, margins)
-    simulated = _simulation(case, controller, margins)
+    quickest = _plan_change(case, controller, margins)
+    simulated = _simulate_with(case, controller, margins)
     if lead is None:
         free = "transition_time" not in problem.targets
         reference, figures, bands = _select_reference(quickest, simulated, free)
@@ -138,7 +138,7 @@ def finish(
     reason, findings = _explain(case, margins, factor, robustness, (figures, bands))
     m = plant.motors
     return Design(
-        gains=wheel_gains(case, controller),
+        gains=convert_gains(case, controller),
         margins=margins,
         reason=reason,
         method=case.method.name,
@@ -170,23 +170,23 @@ def settles(case: Case, feedback: Feedback) -> bool:
     """Tell whether a largest settling time can be stated: the quickest change decides."""
     controller = controller_for(case.problem.loop, feedback)
     margins = loop_margins(case.problem.plant, feedback)
-    quickest = _plan(case, controller, margins)
-    return math.isfinite(_simulation(case, controller, margins)(quickest)[1].settling.high)
+    quickest = _plan_change(case, controller, margins)
+    return math.isfinite(_simulate_with(case, controller, margins)(quickest)[1].settling.high)
 
 
-def _simulation(
+def _simulate_with(
     case: Case, controller: Controller, margins: Margins
 ) -> Callable[[Reference], tuple[Performance, Specification]]:
     """Return the simulated figures of a change of set-point."""
     usual, feedback = _sample_usual(case), controller.feedback
     noise, found = case.problem.control_noise(feedback), case.ensemble.margins(feedback)
-    return lambda plan: figures_of(case, usual, controller, plan, (margins, found), noise)
+    return lambda plan: compute_figures(case, usual, controller, plan, (margins, found), noise)
 
 
 def with_reference(case: Case, one: Design, reference: Reference) -> Design:
     """Return a design with another reference, and the figures that go with it."""
     controller = controller_for(one.loop, one.feedback)
-    figures, bands = _simulation(case, controller, one.margins)(reference)
+    figures, bands = _simulate_with(case, controller, one.margins)(reference)
     return replace(one, reference=reference, performance=figures, specification=bands)
 
 
@@ -197,7 +197,7 @@ def _sample_usual(case: Case, motors: Motors | None = None) -> Plant:
     return sample(motors or nominal, expected, believed=nominal)
 
 
-def wheel_gains(case: Case, controller: Controller) -> PidGains:
+def convert_gains(case: Case, controller: Controller) -> PidGains:
     """Return the running controller's settings, per wheel rad/s."""
     loop, m = case.problem.loop, case.problem.plant.motors
     ratio, fb = loop.gear_ratio, controller.feedback
@@ -216,13 +216,13 @@ def wheel_gains(case: Case, controller: Controller) -> PidGains:
         setpoint_weight_p=controller.weight,
         setpoint_weight_d=controller.weight_d,
         derivative_filter_time_constant=fb.filter_time,
-        feedforward_static=case.swallowed,
+        feedforward_static=case.lost_voltage,
         feedforward_velocity=float(m.a0[0]) * ratio,
         feedforward_acceleration=float(m.a1[0]) * ratio,
     )
 
 
-def _plan(case: Case, controller: Controller, margins: Margins) -> Reference:
+def _plan_change(case: Case, controller: Controller, margins: Margins) -> Reference:
     loop, usual = case.problem.loop, _sample_usual(case)
     plants = [usual]
     if case.lag_in_doubt:
@@ -265,8 +265,8 @@ def _explain(
     loop, (figures, bands) = case.problem.loop, simulated
     words = [
         f"{case.method.title} at {loop.rate:g} Hz with {1e3 * loop.loop_delay:.3g} ms of delay"
-        f"{_sensor(case)}: phase margin {margins.phase:.0f} deg, Ms {margins.sensitivity:.2f}, "
-        f"crossover {margins.crossover:.3g} rad/s"
+        f"{_describe_sensor(case)}: phase margin {margins.phase:.0f} deg, "
+        f"Ms {margins.sensitivity:.2f}, crossover {margins.crossover:.3g} rad/s"
     ]
     findings = list(case.findings)
     if case.drawn:
@@ -283,7 +283,7 @@ def _explain(
     if unmodelled is not None:
         words.append(
             f"unmodelled dynamics reach {100 * robustness.unmodelled:.0f} % of the loop's bound"
-            + known_words(unmodelled, ": ")
+            + describe_known_band(unmodelled, ": ")
         )
         # Beyond the crossover |T| is as large as the gains: so much of it the rule's had.
         if robustness.unmodelled > MIN_LIMITING_SHARE * min(factor, 1.0):
@@ -310,7 +310,7 @@ def _explain(
     return "; ".join(words), tuple(findings)
 
 
-def _sensor(case: Case) -> str:
+def _describe_sensor(case: Case) -> str:
     """Return averaging and lag of the reported speed in words."""
     plant, words = case.problem.plant, ""
     if case.problem.loop.reports_speed and plant.motors.averaging_window[0] > 0 and plant.window:

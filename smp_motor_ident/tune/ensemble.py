@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from smp_motor_ident.tune.feedback import Feedback, spectral_radius
-from smp_motor_ident.tune.margins import BatchMargins, batch_margins, grid_for
+from smp_motor_ident.tune.margins import BatchMargins, batch_margins, make_grid
 from smp_motor_ident.tune.plant import Plant
 from smp_motor_ident.tune.problem import Problem, RequiredMargins
 
@@ -37,7 +37,7 @@ class UncertaintyEnsemble:
         self.plant = plant
         self.required = required
         self.nominal = nominal  # whose unmodelled dynamics the gains must bear
-        self.omega = grid_for(plant, 200)
+        self.omega = make_grid(plant, 200)
         self.response = plant.response(self.omega)
 
     def margins(self, feedback: Feedback) -> BatchMargins:

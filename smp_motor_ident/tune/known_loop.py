@@ -61,7 +61,7 @@ def reconstruct(record: Record, loop: KnownLoop, numbers: Mapping[str, float]) -
             f"{where}: the supply is unknown, and so is a command's voltage; map "
             "supply_voltage=VOLTS"
         )
-    T = _interval(record, loop, numbers)
+    T = _check_interval(record, loop, numbers)
     record = _cut_at_lost_sample(record, T)
     assert record.velocity is not None
     if record.voltage[1] != 0.0 or record.velocity[0] != 0.0:
@@ -74,8 +74,8 @@ def reconstruct(record: Record, loop: KnownLoop, numbers: Mapping[str, float]) -
     setting = Setting(numbers, T, supply, ticks)
     speed = record.velocity / record.hardware.gear_ratio
     speed, step, counted = _restore_loop_speed(speed, setting)
-    volts = _run(loop.start(setting), record.voltage, speed)
-    error = _error(loop, setting, record.voltage, speed, step)
+    volts = _replay(loop.start(setting), record.voltage, speed)
+    error = _find_error(loop, setting, record.voltage, speed, step)
     if error > MAX_COMMAND_ERROR * supply:
         raise SignalError(
             f"{where}: the speed was logged in steps of {step:.3g} rad/s, so the command is known "
@@ -92,7 +92,7 @@ def reconstruct(record: Record, loop: KnownLoop, numbers: Mapping[str, float]) -
     return replace(record, voltage=volts, findings=(*record.findings, note), **counted)
 
 
-def _interval(record: Record, loop: KnownLoop, numbers: Mapping[str, float]) -> float:
+def _check_interval(record: Record, loop: KnownLoop, numbers: Mapping[str, float]) -> float:
     """Return the loop's interval, which is the log's [s]."""
     logged, T = record.sample_time, loop.interval(numbers)
     if math.isnan(T):
@@ -143,7 +143,7 @@ def _restore_loop_speed(speed: Array, setting: Setting) -> tuple[Array, float, d
     return speed, step if on_grid else 0.0, {}
 
 
-def _run(step: Step, setpoints: Array, speed: Array) -> Array:
+def _replay(step: Step, setpoints: Array, speed: Array) -> Array:
     """Return the voltages over the intervals that end at the samples."""
     volts = np.zeros(speed.size)
     for k in range(speed.size - 1):
@@ -151,14 +151,16 @@ def _run(step: Step, setpoints: Array, speed: Array) -> Array:
     return volts
 
 
-def _error(loop: KnownLoop, setting: Setting, setpoints: Array, speed: Array, step: float) -> float:
+def _find_error(
+    loop: KnownLoop, setting: Setting, setpoints: Array, speed: Array, step: float
+) -> float:
     """Return the error of the command by rounding of the logged speed, rms [V]."""
     if step == 0.0:
         return 0.0
     rng: Any = np.random.default_rng(0)
-    plain = _run(loop.start(setting), setpoints, speed)
+    plain = _replay(loop.start(setting), setpoints, speed)
     errors = []
     for _ in range(DITHER_COUNT):
         other = speed + rng.uniform(-0.5, 0.5, speed.size) * step
-        errors.append(_run(loop.start(setting), setpoints, other) - plain)
+        errors.append(_replay(loop.start(setting), setpoints, other) - plain)
     return float(np.sqrt(np.mean(np.square(errors))))

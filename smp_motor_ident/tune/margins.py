@@ -47,7 +47,7 @@ def frequencies(sample_time: float, slowest: float, count: int = 500) -> Array:
     return np.geomspace(lowest, nyquist, count, dtype=np.float64)
 
 
-def grid_for(plant: Plant, count: int = 500) -> Array:
+def make_grid(plant: Plant, count: int = 500) -> Array:
     """Return the frequency grid that suits a batch of plants; see :func:`frequencies`."""
     motors = plant.motors
     return frequencies(plant.sample_time, float(np.min(motors.a0 / motors.a1)), count)
@@ -69,7 +69,7 @@ class BatchMargins:
 
 def loop_margins(plant: Plant, feedback: Feedback) -> Margins:
     """Return the margins of one loop, to six digits or better."""
-    omega = grid_for(plant, 1000)
+    omega = make_grid(plant, 1000)
     for _ in range(3):
         loop = plant.response(omega)[:1] * feedback.response(omega, plant.sample_time)
         m = batch_margins(loop, omega)

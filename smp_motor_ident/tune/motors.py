@@ -61,9 +61,9 @@ class Friction:
         return self.known if self.finding is None else self.high
 
 
-def friction_of(estimate: Estimate, supply: float) -> Friction:
+def bound_friction(estimate: Estimate, supply: float) -> Friction:
     """Return the dry friction that feed-forward may rely on."""
-    quantity = _static_voltage(estimate)
+    quantity = _find_static_voltage(estimate)
     if quantity is None:
         words = "dry friction was not identified: the feed-forward leaves it to the integral"
         return Friction(0.0, 0.0, 0.0, Finding("friction_unknown", "warning", words))
@@ -94,7 +94,7 @@ def friction_of(estimate: Estimate, supply: float) -> Friction:
     return Friction(low, low, high, Finding("friction_range", "warning", words, evidence, advice))
 
 
-def _static_voltage(estimate: Estimate) -> Quantity | None:
+def _find_static_voltage(estimate: Estimate) -> Quantity | None:
     quantity = estimate.combinations.get("static_voltage")
     torque = estimate.parameters.get("coulomb_friction")
     if quantity is not None or torque is None or torque.value is None:
@@ -103,9 +103,11 @@ def _static_voltage(estimate: Estimate) -> Quantity | None:
     return Quantity(per * torque.value, None if torque.std is None else per * torque.std)
 
 
-def motors_of(estimate: Estimate) -> Motors:
+def make_motors(estimate: Estimate) -> Motors:
     """Return the motor of an estimate, from whatever combinations or parameters it holds."""
-    return _motors(estimate, {name: np.array([estimate.value(name)]) for name in _names(estimate)})
+    return _convert_values(
+        estimate, {name: np.array([estimate.value(name)]) for name in _list_quantities(estimate)}
+    )
 
 
 def draw_motors(
@@ -117,11 +119,11 @@ def draw_motors(
     there.  An unreliable estimate is drawn at least as wide as its unexplained share.  A second lag
     that the record hides is uniform over its range.
     """
-    names = _names(estimate)
+    names = _list_quantities(estimate)
     mean = np.array([estimate.value(name) for name in names])
     covariance = _covariance(estimate, names, mean)
     wide = friction is not None and friction.high > friction.low
-    hidden = _hidden_lag(estimate)
+    hidden = _bound_hidden_lag(estimate)
     if not (np.any(np.diag(covariance) > 0) or wide or hidden):
         return None
     positive = np.array([name in _POSITIVE for name in names])
@@ -138,7 +140,7 @@ def draw_motors(
     }
     if hidden and "dc_gain" in names:
         values["time_constant_product"] = rng.uniform(*hidden, n)
-    motors = _motors(estimate, values)
+    motors = _convert_values(estimate, values)
     if friction is not None:
         static = np.clip(motors.static_voltage, friction.low, friction.high)
         if np.ptp(static) == 0.0 and wide:
@@ -147,7 +149,7 @@ def draw_motors(
     return motors
 
 
-def _hidden_lag(estimate: Estimate) -> tuple[float, float] | None:
+def _bound_hidden_lag(estimate: Estimate) -> tuple[float, float] | None:
     """Return the range of a product of lags [s^2] that has no stated value."""
     product = estimate.combinations.get("time_constant_product")
     if product is None or product.value is not None or product.ci95 is None:
@@ -170,7 +172,7 @@ def report_sensor_lag(estimate: Estimate) -> Finding | None:
     )
 
 
-def torque_noise_of(estimate: Estimate, sample_time: float) -> float:
+def compute_torque_noise(estimate: Estimate, sample_time: float) -> float:
     """Return the fluctuating load as an equivalent voltage over a sample [V rms].
 
     A model error larger than the response itself is a resonance and belongs to the bands of
@@ -184,7 +186,7 @@ def torque_noise_of(estimate: Estimate, sample_time: float) -> float:
     return load / math.sqrt(sample_time)
 
 
-def outliers_of(estimate: Estimate) -> float:
+def compute_outlier_share(estimate: Estimate) -> float:
     """Return the share of the reported speed's readings that were left out as outliers."""
     found = (f for f in estimate.findings if f.code == "glitches")
     return sum(float(f.evidence["samples"] or 0.0) for f in found) / max(estimate.samples, 1)
@@ -238,7 +240,7 @@ def unreliable_spread(estimate: Estimate) -> float:
     return min(max(MIN_UNRELIABLE_STD, unexplained), 0.5)
 
 
-def _names(estimate: Estimate) -> tuple[str, ...]:
+def _list_quantities(estimate: Estimate) -> tuple[str, ...]:
     if estimate.value("dc_gain") and estimate.value("time_constant"):
         return (*COMBINATIONS, *SENSOR)
     if all(estimate.value(n) for n in ("resistance", "motor_constant", "inertia")):
@@ -252,7 +254,7 @@ def _names(estimate: Estimate) -> tuple[str, ...]:
     )
 
 
-def _motors(estimate: Estimate, value: dict[str, Array]) -> Motors:
+def _convert_values(estimate: Estimate, value: dict[str, Array]) -> Motors:
     if "dc_gain" in value:
         a0 = 1 / value["dc_gain"]
         a1 = value["time_constant"] * a0

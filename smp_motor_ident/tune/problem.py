@@ -13,7 +13,7 @@ from smp_motor_control.arrays import Array, Complex
 from smp_motor_ident.errors import DesignError
 from smp_motor_ident.tune.feedback import Feedback
 from smp_motor_ident.tune.loop import Loop
-from smp_motor_ident.tune.margins import grid_for
+from smp_motor_ident.tune.margins import make_grid
 from smp_motor_ident.tune.plant import Plant
 from smp_motor_ident.tune.unmodelled import UnmodelledDynamics
 
@@ -45,12 +45,12 @@ class Problem:
     loop: Loop  # the loop that will run
     targets: Mapping[str, Any] = field(default_factory=dict)  # targets of the caller
     unmodelled: UnmodelledDynamics | None = None  # error bound of the model
-    shaking: float = 1.0  # of the speed, by noise, that is allowed: times the usual limit
+    speed_noise_factor: float = 1.0  # on the usual limit of the speed's noise
 
     @cached_property
     def omega(self) -> Array:
         """Frequency grid for searches, shape (f,), [rad/s]."""
-        return grid_for(self.plant, 160)
+        return make_grid(self.plant, 160)
 
     @cached_property
     def response(self) -> Complex:
@@ -107,13 +107,13 @@ class Problem:
         tau = float(m.a1[0] / m.a0[0])
         root = math.sqrt(max(tau**2 - 4 * float(m.a2[0] / m.a0[0]), 0.0))
         fast = 0.5 * (tau - root)
-        dead = 0.5 * T + measured_lag(self.plant, self.loop.loop_delay)
+        dead = 0.5 * T + compute_measured_lag(self.plant, self.loop.loop_delay)
         return FirstOrderDelay(1 / float(m.a0[0]), tau - fast / 2, dead + fast / 2)
 
     @cached_property
     def ultimate(self) -> tuple[float, float]:
         """Ultimate gain [V s/rad] and period [s] of the sampled loop under P control."""
-        omega = grid_for(self.plant, 2000)
+        omega = make_grid(self.plant, 2000)
         response = self.plant.response(omega)[0]
         phase = np.unwrap(np.angle(response))
         beyond = np.flatnonzero(phase <= -np.pi)
@@ -166,7 +166,7 @@ class Method:
     targets: tuple[str, ...] = ()  # keywords that it understands in addition to the common ones
 
 
-def measured_lag(plant: Plant, delay: float) -> float:
+def compute_measured_lag(plant: Plant, delay: float) -> float:
     """Return how much later than the motor's speed the measurement shows it [s]."""
     late = delay + float(plant.motors.delay[0])
     if plant.window:

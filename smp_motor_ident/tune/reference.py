@@ -29,7 +29,7 @@ from smp_motor_ident.errors import DesignError
 from smp_motor_ident.tune.feedback import Feedback
 from smp_motor_ident.tune.loop import Loop
 from smp_motor_ident.tune.plant import Plant, sample
-from smp_motor_ident.tune.problem import check_target, measured_lag
+from smp_motor_ident.tune.problem import check_target, compute_measured_lag
 from smp_motor_ident.tune.simulation import Controller, Inputs, simulate, step_figures
 
 STEADY_VOLTAGE_SHARE = 0.92
@@ -144,10 +144,10 @@ def plan_reference(
     duration = check_target(targets, "transition_time")
     m = plant.motors
     plan = Reference(
-        max_velocity=_reachable(plant, loop, speed),
+        max_velocity=_limit_velocity(plant, loop, speed),
         max_acceleration=math.inf,
         transition_time=0.0,
-        lag=measured_lag(plant, loop.expected_delay),
+        lag=compute_measured_lag(plant, loop.expected_delay),
         doubt=0.0 if targets.get("together") else loop.delay_doubt,
         drive=Drive(
             top_speed=(PEAK_VOLTAGE_SHARE * loop.supply_voltage - float(m.static_voltage[0]))
@@ -156,10 +156,10 @@ def plan_reference(
             time_constant_product=float(m.a2[0] / m.a0[0]),
         ),
     )
-    plan = _quickest(plants, loop, controller, plan, least)
+    plan = _find_shortest(plants, loop, controller, plan, least)
     quickest = plan.transition_time
     if rate is not None or math.isfinite(min(drive, slew)):
-        steepest = _steepest(plan, PEAK_VOLTAGE_SHARE * slew / float(m.a0[0]))
+        steepest = _limit_acceleration(plan, PEAK_VOLTAGE_SHARE * slew / float(m.a0[0]))
         steepest = min(steepest, PEAK_VOLTAGE_SHARE * drive / float(m.a1[0]))
         rate = steepest if rate is None else rate
         if rate > steepest:
@@ -180,7 +180,7 @@ def plan_reference(
     return plan
 
 
-def _reachable(plant: Plant, loop: Loop, wished: float | None) -> float:
+def _limit_velocity(plant: Plant, loop: Loop, wished: float | None) -> float:
     m, ratio = plant.motors, loop.gear_ratio
     top = float((STEADY_VOLTAGE_SHARE * loop.supply_voltage - m.static_voltage[0]) / m.a0[0])
     if top <= 0:
@@ -197,7 +197,7 @@ def _reachable(plant: Plant, loop: Loop, wished: float | None) -> float:
     return 0.9 * top if wished is None else wished
 
 
-def _quickest(
+def _find_shortest(
     plants: Sequence[Plant], loop: Loop, controller: Controller, plan: Reference, least: float
 ) -> Reference:
     """Return the plan with the shortest change of speed, however small, that does not overshoot.
@@ -214,7 +214,7 @@ def _quickest(
     grains = math.ceil(max(0.01, least) / grain)
     while True:
         plan = replace(plan, transition_time=round(grains * grain, 9))
-        if all(_overshoot(led, one, linear, plan) <= most for led, one, most in trials):
+        if all(_measure_overshoot(led, one, linear, plan) <= most for led, one, most in trials):
             return plan
         grains += max(1, grains // 16)
         if grains * grain > MAX_TRANSITION_S:
@@ -225,7 +225,7 @@ def _quickest(
     )
 
 
-def _overshoot(led: Plant, plant: Plant, controller: Controller, plan: Reference) -> float:
+def _measure_overshoot(led: Plant, plant: Plant, controller: Controller, plan: Reference) -> float:
     """Return the overshoot of a small change [%], which is planned for a motor that it leads."""
     slow, T = plan.drive.time_constant, plant.sample_time
     time = T * np.arange(
@@ -237,7 +237,7 @@ def _overshoot(led: Plant, plant: Plant, controller: Controller, plan: Reference
     return step_figures(time, run.speed[0], run.voltage[0], 1.0).overshoot
 
 
-def _steepest(plan: Reference, slew: float) -> float:
+def _limit_acceleration(plan: Reference, slew: float) -> float:
     """Return the largest acceleration that no change of speed takes beyond the voltage.
 
     Nor beyond how fast that changes, as the speed [rad/s^2] that it would hold for ever.

@@ -113,7 +113,7 @@ def simulate(
 
 
 @compiled
-def _turned(newest: float, oldest: float, count_angle: float) -> float:
+def _measure_turn(newest: float, oldest: float, count_angle: float) -> float:
     """Return the angle between two instants, in whole counts where there are counts."""
     if count_angle > 0.0:
         counts = math.floor(newest / count_angle) - math.floor(oldest / count_angle)
@@ -122,22 +122,22 @@ def _turned(newest: float, oldest: float, count_angle: float) -> float:
 
 
 @compiled
-def _averaged(weights: Array, angle: Array, count_angle: float) -> float:
+def _average_speed(weights: Array, angle: Array, count_angle: float) -> float:
     """Return the weighted sum of the angles run through in the last steps."""
     total = 0.0
     for q in range(weights.size):
-        total += weights[q] * _turned(angle[q], angle[q + 1], count_angle)
+        total += weights[q] * _measure_turn(angle[q], angle[q + 1], count_angle)
     return total
 
 
 @compiled
-def _rounded(speed: float, step: float) -> float:
+def _round_speed(speed: float, step: float) -> float:
     """Return a speed as it is reported."""
     return step * math.floor(speed / step + 0.5) if step > 0.0 else speed
 
 
 @compiled
-def _drag(speed: float, friction: float, past: Array, reach: Array, load: float) -> float:
+def _compute_drag(speed: float, friction: float, past: Array, reach: Array, load: float) -> float:
     """Return the voltage of dry friction over a sample [V]; at rest it cancels what pushes."""
     if speed != 0.0 or friction == 0.0:
         return float(friction * np.sign(speed))
@@ -149,7 +149,7 @@ def _drag(speed: float, friction: float, past: Array, reach: Array, load: float)
 
 
 @compiled
-def _observed(
+def _observe(
     advance: Array, by_angle: Array, by_voltage: Array, state: Array, swept: float, voltage: float
 ) -> Array:
     """Return the observer's state after a sample."""
@@ -200,8 +200,8 @@ def _run(
         for k in range(steps):
             measured = observer[SPEED] if observer.size else x[sensor]
             if window > 0:
-                measured = _averaged(average[j], angle, count_angle)
-            measured = _rounded(measured + noise[j, k], speed_step)
+                measured = _average_speed(average[j], angle, count_angle)
+            measured = _round_speed(measured + noise[j, k], speed_step)
             reference = min(max(measured, low[k]), high[k])
             slope = weight_d * reference - measured
             rate = (filter_time * rate + slope - previous) / (filter_time + T)
@@ -217,7 +217,7 @@ def _run(
                 past[q], given_out[q] = past[q - 1], given_out[q - 1]
             past[0] = given
             given_out[0], last = apply_driver(driver, lane, given, back_emf[j] * x[0], last, T)
-            drag = _drag(x[0], friction[j], given_out, taps_angle[j], load[j, k])
+            drag = _compute_drag(x[0], friction[j], given_out, taps_angle[j], load[j, k])
             swept = 0.0
             following[:] = 0.0
             for a in range(s):
@@ -238,10 +238,10 @@ def _run(
             place += swept
             angle[0] = place + angle_noise[j, k] + eccentric * math.sin(place + j)
             if observer.size:
-                swept = _turned(angle[0], before, count_angle)
+                swept = _measure_turn(angle[0], before, count_angle)
                 delayed = np.sum(observer_taps * past[: observer_taps.size])
                 delayed -= modelled * np.sign(observer[SPEED])
-                observer[:] = _observed(advance, by_angle, by_voltage, observer, swept, delayed)
+                observer[:] = _observe(advance, by_angle, by_voltage, observer, swept, delayed)
                 innovation = observer[0] / by_angle[0]
                 surprise += memory * (innovation * innovation / variance - surprise)
                 contradicted[j] |= surprise > DISTRUST_RATIO

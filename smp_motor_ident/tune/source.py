@@ -21,7 +21,7 @@ from smp_motor_ident.tune.loop import Loop
 WINDOWS = (2, 4, 8, 16)
 """Samples to difference over that are tried in addition to the reported speed."""
 
-WORTH_WINDOW, WORTH_OBSERVER = 1.15, 1.5
+WINDOW_BENEFIT, OBSERVER_BENEFIT = 1.15, 1.5
 """How many times better a load must be rejected for a longer window, and for the observer, which
 leans on the model, to be taken."""
 
@@ -64,7 +64,7 @@ class Trial:
 
 def choose_source(estimate: Estimate, loop: Loop, **targets: Any) -> tuple[Loop, str]:
     """Return the loop with the speed source to take, and the reason."""
-    usual = _trial(estimate, loop, targets)
+    usual = _try_source(estimate, loop, targets)
     if loop.counts_per_revolution is None:
         words = "the reported speed: the encoder's counts are not known"
         return loop, words + _remark_on_averaging(estimate, loop, usual, targets)
@@ -72,9 +72,9 @@ def choose_source(estimate: Estimate, loop: Loop, **targets: Any) -> tuple[Loop,
     counted = replace(
         loop, speed_source="difference", difference_window=max(loop.difference_window, 1)
     )
-    longer = _longer(estimate, counted, usual, targets)
-    watched = _trial(estimate, replace(loop, speed_source="observer"), targets)
-    best, unsettled = _best(usual, longer, watched)
+    longer = _try_windows(estimate, counted, usual, targets)
+    watched = _try_source(estimate, replace(loop, speed_source="observer"), targets)
+    best, unsettled = _select_trial(usual, longer, watched)
     if best is None:
         return loop, "the reported speed: no source meets the targets"
     compared = "; ".join(
@@ -87,9 +87,11 @@ def choose_source(estimate: Estimate, loop: Loop, **targets: Any) -> tuple[Loop,
     return best.loop, f"{best.name}: {compared}{lacks}"
 
 
-def _best(*trials: Trial | None) -> tuple[Trial | None, Sequence[Trial]]:
+def _select_trial(*trials: Trial | None) -> tuple[Trial | None, Sequence[Trial]]:
     """Return the best trial in which every motor settles, and the better ones rejected."""
-    left = [(t, w) for t, w in zip(trials, (1.0, WORTH_WINDOW, WORTH_OBSERVER), strict=True) if t]
+    left = [
+        (t, w) for t, w in zip(trials, (1.0, WINDOW_BENEFIT, OBSERVER_BENEFIT), strict=True) if t
+    ]
     passed: list[Trial] = []
     while left:
         best = left[0]
@@ -103,14 +105,14 @@ def _best(*trials: Trial | None) -> tuple[Trial | None, Sequence[Trial]]:
     return (passed[0] if passed else None), ()
 
 
-def _longer(
+def _try_windows(
     estimate: Estimate, loop: Loop, usual: Trial | None, targets: dict[str, Any]
 ) -> Trial | None:
     """Return the best of the longer windows, where the control noise is what holds gains back."""
     if usual is not None and usual.control_noise <= 0.9 * loop.noise_limit:
         return None
     windows = [
-        _trial(estimate, replace(loop, difference_window=w), targets)
+        _try_source(estimate, replace(loop, difference_window=w), targets)
         for w in WINDOWS
         if w > loop.difference_window
     ]
@@ -129,8 +131,8 @@ def _remark_on_averaging(
     taken = (
         f", assumed to be the angle's difference over {loop.difference_window} samples of the loop"
     )
-    longer = _longer(estimate, loop, usual, targets)
-    if longer is None or (usual is not None and longer.integral < WORTH_WINDOW * usual.integral):
+    longer = _try_windows(estimate, loop, usual, targets)
+    if longer is None or (usual is not None and longer.integral < WINDOW_BENEFIT * usual.integral):
         return taken
     window, now = longer.loop.difference_window, 0.0 if usual is None else usual.integral
     return (
@@ -139,7 +141,7 @@ def _remark_on_averaging(
     )
 
 
-def _trial(estimate: Estimate, loop: Loop, targets: dict[str, Any]) -> Trial | None:
+def _try_source(estimate: Estimate, loop: Loop, targets: dict[str, Any]) -> Trial | None:
     # The control noise that the loop allows is a limit here: nothing is gained by noise.
     strict = replace(loop, noise_voltage=loop.noise_limit)
     try:

@@ -28,7 +28,7 @@ from smp_motor_ident.tune.simulation import (
     simulate,
     step_figures,
 )
-from smp_motor_ident.tune.unmodelled import added_by_resonance
+from smp_motor_ident.tune.unmodelled import compute_resonance_effect
 
 
 @dataclass(frozen=True)
@@ -110,7 +110,7 @@ WORK, MIN_DRAWS = 1e6, 100
 """Samples that are simulated for a specification, and least motors."""
 
 
-def figures_of(
+def compute_figures(
     case: Case, usual: Plant, controller: Controller, reference: Reference,
     kept: tuple[Margins, BatchMargins], control_noise: float,
 ) -> tuple[Performance, Specification]:  # fmt: skip
@@ -118,15 +118,15 @@ def figures_of(
     problem, (margins, found) = case.problem, kept
     loop = replace(problem.loop, delay=problem.loop.expected_delay)
     change = STEP_SHARE * reference.max_velocity
-    time = _instants(problem, controller.feedback, reference)
+    time = _list_instants(problem, controller.feedback, reference)
     plan = planned_change(usual, reference, change, time)
     run = simulate(usual, controller, plan.inputs)
     planned = step_figures(time, run.speed[0], run.voltage[0], change)
     answer = run.speed[0] / change
-    figures = _performance(problem, controller.feedback, time, planned, control_noise)
-    each = _runs(case, controller, loop, plan, change, time)
+    figures = _measure_performance(problem, controller.feedback, time, planned, control_noise)
+    each = _simulate_ensemble(case, controller, loop, plan, change, time)
     gain = band(margins.gain, found.gain)
-    more, longer = added_by_resonance(problem.unmodelled, usual, controller.feedback, answer)
+    more, longer = compute_resonance_effect(problem.unmodelled, usual, controller.feedback, answer)
     return figures, Specification(
         samples=len(each) if case.drawn else 0,
         change=change,
@@ -139,7 +139,7 @@ def figures_of(
     )
 
 
-def _runs(
+def _simulate_ensemble(
     case: Case, controller: Controller, loop: Loop, plan: Change, change: float, time: Array
 ) -> list[StepFigures]:
     """Simulate a change with every motor that may be, with counts, noise, friction and driver."""
@@ -148,8 +148,8 @@ def _runs(
     motors = drawn if case.drawn else nominal
     plant = sample(motors, loop, believed=nominal)
     shape = (len(plant), time.size)
-    counted = _counted(plant, case.problem.plant)
-    forward = plan.forward + case.swallowed * plan.friction
+    counted = _mark_counted(plant, case.problem.plant)
+    forward = plan.forward + case.lost_voltage * plan.friction
     most = min(math.sqrt(3.0) * case.scatter / loop.sample_time, 1.0)
     late = np.random.default_rng(3).uniform(-most, most, shape)  # of each step [samples]
     run = simulate(
@@ -160,7 +160,7 @@ def _runs(
             forward=forward,
             load=_draw_loads(case, plant.motors.static_voltage, shape)
             + late * np.diff(forward, prepend=forward[0]),
-            noise=_reported_noise(case, loop, shape)
+            noise=_draw_noise(case, loop, shape)
             + late * np.diff(plan.reference, prepend=plan.reference[0]),
             angle_noise=draw_white_noise(loop.angle_noise, shape, of=counted),
         ),
@@ -168,7 +168,7 @@ def _runs(
         speed_step=loop.rounding,
         eccentric=np.where(counted, case.eccentric, 0.0),
         friction=motors.static_voltage if case.drawn else np.array([case.friction.known]),
-        modelled=case.swallowed,
+        modelled=case.lost_voltage,
         driver=case.driver,
     )
     each = [
@@ -182,7 +182,7 @@ def _runs(
     ]
 
 
-def _counted(plant: Plant, nominal: Plant) -> NDArray[np.bool_]:
+def _mark_counted(plant: Plant, nominal: Plant) -> NDArray[np.bool_]:
     """Tell for each motor whether the running loop's speed is made from counts.
 
     A filter's is not, nor that of an alternative with a window so much shorter than the nominal
@@ -205,7 +205,7 @@ def _draw_loads(case: Case, friction: Array, shape: tuple[int, int]) -> Array:
     return held if noise is None else held + noise
 
 
-def _reported_noise(case: Case, loop: Loop, shape: tuple[int, int]) -> Array | float:
+def _draw_noise(case: Case, loop: Loop, shape: tuple[int, int]) -> Array | float:
     """Return the noise of the reported speed, with the outliers that the running loop believes.
 
     They have any size up to the top speed; the loop rejects changes impossible for a motor.
@@ -216,7 +216,7 @@ def _reported_noise(case: Case, loop: Loop, shape: tuple[int, int]) -> Array | f
         return 0.0 if noise is None else noise
     motor = case.problem.plant.motors
     top = loop.supply_voltage / float(motor.a0[0])
-    load = LOAD_SHARE * loop.supply_voltage + case.swallowed
+    load = LOAD_SHARE * loop.supply_voltage + case.lost_voltage
     believed = (
         MIN_OUTLIER_DEVIATIONS * loop.reported_noise + load / float(motor.a1[0]) * loop.sample_time
     )
@@ -225,7 +225,7 @@ def _reported_noise(case: Case, loop: Loop, shape: tuple[int, int]) -> Array | f
     return np.asarray(noise + np.where(there, believed * rng.uniform(-1.0, 1.0, shape), 0.0))
 
 
-def _performance(
+def _measure_performance(
     problem: Problem, feedback: Feedback, time: Array, planned: StepFigures, control_noise: float
 ) -> Performance:
     """Add figures of the feedback alone, by a change so small that nothing saturates."""
@@ -256,7 +256,7 @@ def band(value: float, over: Sequence[float] | Array, added: float = 0.0) -> Ban
     return Band(value, float(low), float(high) + added)
 
 
-def _instants(problem: Problem, fb: Feedback, reference: Reference) -> Array:
+def _list_instants(problem: Problem, fb: Feedback, reference: Reference) -> Array:
     """Return the instants over which a change of set-point is simulated, until it is over."""
     T = problem.loop.sample_time
     span = reference.transition_time + 8 * problem.reduced.time_constant

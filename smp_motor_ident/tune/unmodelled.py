@@ -52,7 +52,7 @@ FREQUENCY_COUNT = 40  # number of resonance frequencies, from the lowest of the 
 DAMPINGS = np.geomspace(RESONANCE_DAMPING, MAX_RESONANCE_DAMPING, 4)
 """Of resonances, evenly spread over those of shafts."""
 
-SHORTEST, LONGEST = 2**13, 2**16
+MIN_SAMPLES, MAX_SAMPLES = 2**13, 2**16
 """Samples over which a resonance is followed; feedback may reduce its damping."""
 
 
@@ -104,7 +104,7 @@ def describe_known_band(unmodelled: UnmodelledDynamics | None, before: str = "; 
     return f"{before}the recording shows the motor's response up to {unmodelled.known:.3g} rad/s"
 
 
-def added_by_resonance(
+def compute_resonance_effect(
     unmodelled: UnmodelledDynamics | None, plant: Plant, feedback: Feedback, answer: Array
 ) -> tuple[float, float]:
     """Return the most that a resonance adds to overshoot and settling of a change of set-point.
@@ -116,11 +116,11 @@ def added_by_resonance(
         return 0.0, 0.0
     T = plant.sample_time
     ringing = -math.log(SETTLING_BAND) / (RESONANCE_DAMPING * unmodelled.known * T)
-    n = 2 ** math.ceil(math.log2(min(max(answer.size + ringing, SHORTEST), LONGEST)))
+    n = 2 ** math.ceil(math.log2(min(max(answer.size + ringing, MIN_SAMPLES), MAX_SAMPLES)))
     usual = np.pad(answer, (0, n - answer.size), mode="edge")
     time = T * np.arange(n, dtype=np.float64)
     omega = np.asarray(2 * np.pi * np.fft.rfftfreq(n, T)[1:], dtype=np.float64)
-    complementary, moved = _loop(plant, feedback, omega, usual)
+    complementary, moved = _close_loop(plant, feedback, omega, usual)
     settled, highest = settling_time(time, usual), usual.max()
     ends = [settled]
     for error in _largest_errors(unmodelled.frequency.tobytes(), unmodelled.bound.tobytes(), T, n):
@@ -173,7 +173,9 @@ def find_largest_modes(
     return m
 
 
-def _loop(plant: Plant, feedback: Feedback, omega: Array, answer: Array) -> tuple[Complex, Complex]:
+def _close_loop(
+    plant: Plant, feedback: Feedback, omega: Array, answer: Array
+) -> tuple[Complex, Complex]:
     """Return T through the motor, and S Y: the response of the speed to an error."""
     z = np.exp(1j * omega * plant.sample_time)
     control = feedback.response(omega, plant.sample_time)

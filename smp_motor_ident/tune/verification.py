@@ -32,7 +32,7 @@ from smp_motor_ident.limits import (
     SETTLING_BAND,
 )
 from smp_motor_ident.result import Estimate
-from smp_motor_ident.tune.motors import draw_motors, motors_of
+from smp_motor_ident.tune.motors import draw_motors, make_motors
 from smp_motor_ident.tune.simulation import settling_time
 
 SMOOTHING_S = 0.05  # length [s] of the parabola whose slope is taken as the speed
@@ -43,9 +43,9 @@ DRAWS = 12  # motors in addition to the nominal one
 
 MAX_UNKNOWN_SHARE = 0.1  # largest share of samples whose voltage matches no command
 
-_TIME = "raise the scheduling_priority of the wheels' nodes, and reduce the load of the network"
+_TIMING = "raise the scheduling_priority of the wheels' nodes, and reduce the load of the network"
 
-_WHEEL = (
+_WHEEL_ADVICE = (
     "look at the curves in the report: a wheel that touches something, a battery that sags or a "
     "motor that changed since; then commission again"
 )
@@ -112,7 +112,7 @@ def read(time: Array, speed: Array, setpoint: float, tolerance: float) -> Readin
     )
 
 
-def arrival_delays(
+def measure_arrival_delays(
     answers: tuple[Array, Array, Array], applied: tuple[Array, Array], loop: Mapping[str, Any]
 ) -> Array:
     """Return how long each answer took from its sample until the motor had it.
@@ -165,15 +165,15 @@ def predict_speed(
     step = float(loop["sample_time"])
     settings = loop_settings(parameters)
     rows = []
-    for k, entry in enumerate(_motors(estimate, float(loop["supply_voltage"]))):
+    for k, entry in enumerate(_draw_entries(estimate, float(loop["supply_voltage"]))):
         phase = k / (1 + DRAWS)  # of a count; which it was nobody knows
-        angle = _run(entry, settings, setpoints, instants, delays, phase)
+        angle = _simulate_loop(entry, settings, setpoints, instants, delays, phase)
         even, speed = smooth_speed(instants, angle, step)
         rows.append(np.interp(time, even, speed))
     return np.array(rows)
 
 
-def _run(
+def _simulate_loop(
     entry: MotorEntry, settings: LoopSettings, setpoints: Array, instants: Array, delays: Array,
     phase: float,
 ) -> Array:  # fmt: skip
@@ -199,7 +199,7 @@ def _run(
     return angle
 
 
-def bands_of(
+def compute_bands(
     rows: Array, time: Array, setpoint: float, specification: Mapping[str, Any], unsure: float
 ) -> Reading:
     """Return the largest readings within the design and the uncertainty of the motor.
@@ -209,8 +209,8 @@ def bands_of(
     """
     margin = RESOLUTION_SIGMAS * unsure / abs(setpoint)
     simulated = [read(time, row, setpoint, SETTLING_BAND + margin) for row in rows]
-    settling = [one.settling for one in simulated] + [_high(specification, "settling")]
-    overshoot = [one.overshoot for one in simulated] + [_high(specification, "overshoot")]
+    settling = [one.settling for one in simulated] + [_read_limit(specification, "settling")]
+    overshoot = [one.overshoot for one in simulated] + [_read_limit(specification, "overshoot")]
     step = float(np.median(np.diff(time)))
     return Reading(
         settling=max(*settling, _limit(settling[:-1])) + 2 * step,
@@ -228,7 +228,7 @@ def _limit(readings: Sequence[float]) -> float:
     return float(np.mean(readings) + quantile * np.std(readings, ddof=1) * math.sqrt(1 + 1 / n))
 
 
-def change_of(
+def read_change(
     wheel: str, name: str, setpoint: float, time: Array, speed: Array, rows: Array,
     specification: Mapping[str, Any], unsure: float, before: float = 0.0,
 ) -> Change:  # fmt: skip
@@ -241,15 +241,15 @@ def change_of(
         wheel, name, setpoint, time, speed, rows.min(axis=0), rows[0], rows.max(axis=0),
         read(time, moved, change, tolerance),
         expected,
-        bands_of(rows - before, time, change, specification, unsure),
+        compute_bands(rows - before, time, change, specification, unsure),
         tolerance,
         expected.overshoot
-        - _high(specification, "overshoot")
+        - _read_limit(specification, "overshoot")
         - 100 * (tolerance - SETTLING_BAND),
     )  # fmt: skip
 
 
-def _high(specification: Mapping[str, Any], name: str) -> float:
+def _read_limit(specification: Mapping[str, Any], name: str) -> float:
     value = specification[name]["high"]
     return 0.0 if value is None else float(value)
 
@@ -272,7 +272,7 @@ def judge(changes: Sequence[Change]) -> list[Finding]:
                     f"design allows {most:.3g} {unit}",
                     {"wheel": one.wheel, "value": value if math.isfinite(value) else None,
                      "limit": most},
-                    _TIME if one.excess > 0.0 else _WHEEL,
+                    _TIMING if one.excess > 0.0 else _WHEEL_ADVICE,
                 ))  # fmt: skip
     return found
 
@@ -286,7 +286,7 @@ def report_loop_delay(changes: Sequence[Change]) -> list[Finding]:
         f"{worst.wheel}: {worst.name}: the delays of samples and commands alone cause an overshoot "
         f"{worst.excess:.3g} % above the specification"
     )
-    return [Finding("loop_delay", "warning", text, {"excess": worst.excess}, _TIME)]
+    return [Finding("loop_delay", "warning", text, {"excess": worst.excess}, _TIMING)]
 
 
 def report_silence(silence: float) -> list[Finding]:
@@ -295,7 +295,7 @@ def report_silence(silence: float) -> list[Finding]:
         return []
     evidence = {"silence": silence, "limit": MAX_SILENCE}
     text = f"a wheel received no command for {silence:.2f} s, so the drive does not test the gains"
-    return [Finding("verification_disturbed", "refused", text, evidence, _TIME)]
+    return [Finding("verification_disturbed", "refused", text, evidence, _TIMING)]
 
 
 def loop_settings(parameters: Mapping[str, Any]) -> LoopSettings:
@@ -304,9 +304,9 @@ def loop_settings(parameters: Mapping[str, Any]) -> LoopSettings:
     return build_settings(LoopSettings, usual | flatten(parameters))
 
 
-def _motors(estimate: Estimate, supply: float) -> list[MotorEntry]:
+def _draw_entries(estimate: Estimate, supply: float) -> list[MotorEntry]:
     """Return the nominal motor and draws of the estimate's uncertainty."""
-    nominal = motors_of(estimate)
+    nominal = make_motors(estimate)
     drawn = draw_motors(estimate, DRAWS, np.random.default_rng(0))
     hardware = estimate.hardware
     gearbox = Gearbox(hardware.gear_ratio)

@@ -48,22 +48,22 @@ def design_wheels(
     targets["together"] = together
     cases = {w: prepare(e, loops[w], method, targets) for w, e in estimates.items()}
     own = {wheel: finish(case, *solve(case)) for wheel, case in cases.items()}
-    shared, reason = _choose(cases, own, sets)
+    shared, reason = _choose_sets(cases, own, sets)
     if shared is not None:
-        own = {wheel: _with(case, shared) for wheel, case in cases.items()}
+        own = {wheel: _finish_shared(case, shared) for wheel, case in cases.items()}
     if not together:
         return WheelSet(own, f"{reason}; each as fast as its own voltage allows")
-    common, pace = _together(cases, own)
+    common, pace = _plan_together(cases, own)
     return WheelSet(common, f"{reason}; {pace}")
 
 
-def _with(case: Case, shared: Feedback) -> Design:
+def _finish_shared(case: Case, shared: Feedback) -> Design:
     """Finish a design with gains that are per wheel rad/s."""
     mine = shared.scaled(1 / case.problem.loop.gear_ratio)
     return finish(case, mine, 1.0, case.ensemble.assess(mine))
 
 
-def _together(
+def _plan_together(
     cases: Mapping[str, Case], own: Mapping[str, Design]
 ) -> tuple[dict[str, Design], str]:
     """Give all wheels the one reference that the weakest of them can follow."""
@@ -119,7 +119,7 @@ def common_drive(designs: Mapping[str, Design]) -> Drive:
     return common
 
 
-def _choose(
+def _choose_sets(
     cases: Mapping[str, Case], own: Mapping[str, Design], sets: Sets
 ) -> tuple[Feedback | None, str]:
     """Return the feedback for all, per wheel rad/s, or None, and why."""

@@ -42,16 +42,16 @@ def parameters(design: Design) -> dict[str, Any]:
         "reference_delay_uncertainty": float(reference.doubt),
         "drive": {n: float(x) for n, x in dataclasses.asdict(reference.drive).items()},
         "speed_source": str(design.loop.speed_source),
-        "difference_window": _window(design),
+        "difference_window": _choose_window(design),
         "model": {name: float(value) for name, value in design.motor.items()},
-        **_plausible(reference.drive.top_speed, design.loop),
+        **_widen_plausibility(reference.drive.top_speed, design.loop),
         # From where a wheel that stands is at fault, if the usual voltage is too low
         **({"stall_voltage": start} if start > FaultLimits().stall_voltage else {}),
-        **_patience(design),
+        **_extend_time_outs(design),
     }
 
 
-def _patience(design: Design) -> dict[str, float]:
+def _extend_time_outs(design: Design) -> dict[str, float]:
     """Return the times of the stop rule and of lost feedback where the usual ones are too short."""
     reference, times = design.wheel_reference, {}
     profile, sample_time = reference.profile(), design.loop.sample_time
@@ -75,7 +75,7 @@ def silence(loop: Loop) -> float:
     return 3.5 * loop.sample_time
 
 
-def slow_loop(design: Design) -> list[str]:
+def describe_slow_loop(design: Design) -> list[str]:
     """Return required settings of the hardware's driver for a loop with a low rate."""
     needed, interval = silence(design.loop), design.loop.sample_time
     if needed <= DriveSettings().command_timeout:
@@ -86,7 +86,7 @@ def slow_loop(design: Design) -> list[str]:
     ]
 
 
-def _window(design: Design) -> int:
+def _choose_window(design: Design) -> int:
     """Return the samples to difference counts over.
 
     An observer that its counts contradict is replaced by their difference, over as many samples as
@@ -106,7 +106,7 @@ def _window(design: Design) -> int:
     return bisect.bisect_left(range(1000), True, lo=1, key=quiet)
 
 
-def _plausible(top_speed: float, loop: Loop) -> dict[str, float]:
+def _widen_plausibility(top_speed: float, loop: Loop) -> dict[str, float]:
     """Return the limits of plausible feedback where they are not those by default.
 
     A wheel may be faster; the noise of a speed that was recorded is known.
@@ -133,11 +133,11 @@ def gains_document(
         "schema": SCHEMA,
         "provenance": dict(provenance),
         "reason": reason,
-        "wheels": {wheel: _entry(design) for wheel, design in designs.items()},
+        "wheels": {wheel: _write_design(design) for wheel, design in designs.items()},
     }
 
 
-def _entry(design: Design) -> dict[str, Any]:
+def _write_design(design: Design) -> dict[str, Any]:
     bands, reference = design.specification, dataclasses.asdict(design.wheel_reference)
     drive = reference.pop("drive")
     entry = {name: getattr(design, name) for name in _WRITTEN}

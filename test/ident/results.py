@@ -49,7 +49,7 @@ def tuning_of_two(monkeypatch, one: Estimate) -> tuning_page.Tuning:
     monkeypatch.setattr(tuning_page, "PHASE_MARGINS", (60.0,))
     monkeypatch.setattr(tuning_page, "BAND_DRAWS", 20)
     loop = Loop(sample_time=0.005, gear_ratio=65.5, counts_per_revolution=500, supply_voltage=12.0)
-    return tuning_page.tuning_of(one, loop, design(one, loop))
+    return tuning_page.design_tuning(one, loop, design(one, loop))
 
 
 def estimate(wheel: str = "front_left", *, current: bool = True) -> Estimate:

@@ -15,7 +15,7 @@ from smp_motor_ident.errors import ParameterError
 from smp_motor_ident.estimate import estimate
 from smp_motor_ident.infer.planning import what_next
 from smp_motor_ident.record import Hardware, Record
-from smp_motor_ident.tune.motors import torque_noise_of
+from smp_motor_ident.tune.motors import compute_torque_noise
 
 WHEELS = ("front_left", "front_right", "rear_left", "rear_right")
 # Of some fifty quantities tested one in 2000 passes four standard deviations by chance.
@@ -64,7 +64,7 @@ def test_little_torque_noise_is_not_taken_for_much(wheel, noise):
         motors.record(wheel, kinds=("fourier",), seconds=20.0, current=False, torque_noise=noise)
     )
     check(found, motors.truth(wheel, 0.3), ("dc_gain", "time_constant", "static_voltage"))
-    assert torque_noise_of(found, 1 / 200) < 2.0 * noise  # [V] over a sample
+    assert compute_torque_noise(found, 1 / 200) < 2.0 * noise  # [V] over a sample
     record = motors.record(wheel, current=False, torque_noise=noise)
     check(estimate(record), motors.truth(wheel, 0.3), ("dc_gain", "time_constant"))
 

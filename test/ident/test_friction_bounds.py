@@ -7,7 +7,7 @@ import pytest
 
 from smp_motor_ident.errors import DesignError
 from smp_motor_ident.result import Estimate, Quantity
-from smp_motor_ident.tune.motors import friction_of
+from smp_motor_ident.tune.motors import bound_friction
 
 SUPPLY = 12.0
 Z95 = 1.959963985  # of the normal distribution
@@ -19,14 +19,14 @@ def estimate(quantity: Quantity | None, **parameters: Quantity) -> Estimate:
 
 
 def test_a_standard_deviation_alone_gives_a_normal_interval():
-    found = friction_of(estimate(Quantity(1.0, 0.1)), SUPPLY)
+    found = bound_friction(estimate(Quantity(1.0, 0.1)), SUPPLY)
     assert (found.low, found.high) == pytest.approx((1.0 - Z95 * 0.1, 1.0 + Z95 * 0.1), abs=1e-4)
     assert found.known == found.planned == 1.0 and found.finding is None
 
 
 @pytest.mark.parametrize(("half", "known"), [(0.239, True), (0.241, False)])
 def test_friction_is_known_to_a_fiftieth_of_the_supply(half, known):
-    found = friction_of(estimate(Quantity(1.0, 0.1, (1.0 - half, 1.0 + half))), SUPPLY)
+    found = bound_friction(estimate(Quantity(1.0, 0.1, (1.0 - half, 1.0 + half))), SUPPLY)
     assert found.known == (1.0 if known else 1.0 - half)
     assert found.planned == (1.0 if known else 1.0 + half)
     assert (found.finding is None) is known
@@ -36,11 +36,11 @@ def test_friction_is_known_to_a_fiftieth_of_the_supply(half, known):
 
 
 def test_friction_is_neither_negative_nor_above_the_supply():
-    found = friction_of(estimate(Quantity(0.1, 0.5, (-0.9, 1.1))), SUPPLY)
+    found = bound_friction(estimate(Quantity(0.1, 0.5, (-0.9, 1.1))), SUPPLY)
     assert (found.low, found.high) == (0.0, 1.1)
-    found = friction_of(estimate(Quantity(10.0, 2.0, (8.0, 14.0))), SUPPLY)
+    found = bound_friction(estimate(Quantity(10.0, 2.0, (8.0, 14.0))), SUPPLY)
     assert (found.low, found.high) == (8.0, SUPPLY)
-    fixed = friction_of(estimate(Quantity(13.0, None, None, status="fixed")), SUPPLY)
+    fixed = bound_friction(estimate(Quantity(13.0, None, None, status="fixed")), SUPPLY)
     assert (fixed.low, fixed.high, fixed.known) == (13.0, 13.0, 13.0), "the user's word"
 
 
@@ -49,23 +49,23 @@ def test_half_of_the_supply_is_too_much_not_to_know(width, refused):
     given = estimate(Quantity(None, None, (0.0, width), status="unidentifiable"))
     if refused:
         with pytest.raises(DesignError, match=r"anything from 0 to 6\.01 V of the 12 V supply"):
-            friction_of(given, SUPPLY)
+            bound_friction(given, SUPPLY)
     else:
-        assert friction_of(given, SUPPLY).high == width
+        assert bound_friction(given, SUPPLY).high == width
 
 
 def test_friction_that_was_not_identified_is_left_to_the_integral():
-    found = friction_of(estimate(None), SUPPLY)
+    found = bound_friction(estimate(None), SUPPLY)
     assert (found.known, found.low, found.high) == (0.0, 0.0, 0.0)
     assert found.finding is not None and found.finding.code == "friction_unknown"
     for nothing in (Quantity(None), Quantity(1.0, math.inf)):
         with pytest.raises(DesignError, match="from 0 to 12 V"):
-            friction_of(estimate(nothing), SUPPLY)
+            bound_friction(estimate(nothing), SUPPLY)
 
 
 def test_friction_as_a_torque_is_taken_through_resistance_and_motor_constant():
     parts = {"resistance": Quantity(12.0, 0.0), "motor_constant": Quantity(0.02, 0.0)}
     given = estimate(None, coulomb_friction=Quantity(1e-3, 1e-5), **parts)
-    found = friction_of(given, SUPPLY)
+    found = bound_friction(given, SUPPLY)
     assert found.known == pytest.approx(0.6)  # R T / K
     assert found.high - found.low == pytest.approx(2 * Z95 * 0.006, rel=1e-4)

@@ -66,7 +66,9 @@ def test_names_of_users_are_escaped(page):
 def test_page_tells_failures_warnings_and_unidentifiable_parameters(page):
     assert "Voltage is constant; excite the motor." in page
     assert "look alike at 100 Hz" in page
-    assert all(words.put_within(name) in page.split("Not identifiable")[1] for name in PHYSICAL)
+    assert all(
+        words.label_in_sentence(name) in page.split("Not identifiable")[1] for name in PHYSICAL
+    )
 
 
 @pytest.mark.parametrize(

@@ -137,9 +137,9 @@ def test_tune_the_tuning_page_and_the_file_state_one_settling(identified, capsys
     usual = parser().parse_args([str(identified)])
     loops = {w: tuning.loop_for(one, usual) for w, one in estimates.items()}
     loops, _ = tuning.choose_sources(estimates, loops, {})
-    designs, refused = tuning_page.designs_of(estimates, loops)
+    designs, refused = tuning_page.design_all_wheels(estimates, loops)
     assert not refused
-    tunings = {w: tuning_page.tuning_of(estimates[w], loops[w], designs[w]) for w in designs}
+    tunings = {w: tuning_page.design_tuning(estimates[w], loops[w], designs[w]) for w in designs}
     for wheel, shown in tuning_page.page_data(tunings)["wheels"].items():
         stated = entries[wheel]["settling"]
         rows = {name: held for name, *held in shown["choices"][-1]["rows"]}

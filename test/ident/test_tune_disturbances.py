@@ -18,7 +18,7 @@ from smp_motor_ident.record import Hardware, Record
 from smp_motor_ident.result import ChainRecord, ModelError, ResidualTests
 from smp_motor_ident.tune import design
 from smp_motor_ident.tune.case import prepare
-from smp_motor_ident.tune.motors import torque_noise_of
+from smp_motor_ident.tune.motors import compute_torque_noise
 from smp_motor_ident.tune.verification import loop_settings
 from smp_motor_ident.tune.writing import parameters
 
@@ -46,7 +46,7 @@ def test_bands_hold_a_load_that_friction_held_before_the_change():
 def test_jitter_of_instants_widens_the_bands():
     rough = 0.02 * MOTOR["dc_gain"] / MOTOR["time_constant"]  # 0.02 V sqrt(s)
     load = Finding("torque_noise", "warning", "", {"acceleration": rough})
-    assert torque_noise_of(estimate(findings=[load]), 0.01) == pytest.approx(0.2)
+    assert compute_torque_noise(estimate(findings=[load]), 0.01) == pytest.approx(0.2)
     arrivals = Finding("arrival_beat", "note", "", {"latency": 3e-3})
     shaken, scattered, exact = (
         design(estimate(findings=f), LOOP, transition_time=0.05) for f in ([load], [arrivals], [])
@@ -76,7 +76,7 @@ def test_bands_hold_a_load_that_fluctuates_as_the_recording_shows():
     more = shaken.specification.overshoot.high - steady.specification.overshoot.high
     assert 1.0 * wander < more < 6.0 * wander  # of the speed without a loop, which takes some off
     springs = ResidualTests(model_error=ModelError((30.0, 200.0), (0.0, 3.0), (0.1, 3.5)))
-    assert torque_noise_of(replace(estimate(findings=[noise]), residuals=springs), 0.01) == 0.0
+    assert compute_torque_noise(replace(estimate(findings=[noise]), residuals=springs), 0.01) == 0.0
 
 
 def test_outliers_do_not_reach_the_loop():

@@ -12,9 +12,9 @@ from smp_motor_ident.tune.feedback import Feedback, closed_loop
 from smp_motor_ident.tune.loop import Loop
 from smp_motor_ident.tune.margins import loop_margins
 from smp_motor_ident.tune.methods import METHODS
-from smp_motor_ident.tune.methods.margin import at_sensitivity
+from smp_motor_ident.tune.methods.margin import scale_to_sensitivity
 from smp_motor_ident.tune.methods.relay import read_oscillation
-from smp_motor_ident.tune.methods.rules import by_rule
+from smp_motor_ident.tune.methods.rules import apply_rule
 from smp_motor_ident.tune.motors import Motors
 from smp_motor_ident.tune.plant import sample
 from smp_motor_ident.tune.problem import FirstOrderDelay, Problem
@@ -44,12 +44,12 @@ class Reduced(Problem):
 
 
 def test_ziegler_nichols_and_tyreus_luyben_give_their_published_shares():
-    assert by_rule("ziegler_nichols", "pi", 2.0, 1.2) == Feedback(0.9, 0.9)
-    pid = by_rule("ziegler_nichols", "pid", 2.0, 1.0)
+    assert apply_rule("ziegler_nichols", "pi", 2.0, 1.2) == Feedback(0.9, 0.9)
+    pid = apply_rule("ziegler_nichols", "pid", 2.0, 1.0)
     assert (pid.p, pid.p / pid.i, pid.d / pid.p) == pytest.approx((1.2, 0.5, 0.125))
-    pi = by_rule("tyreus_luyben", "pi", 3.2, 1.0)
+    pi = apply_rule("tyreus_luyben", "pi", 3.2, 1.0)
     assert (pi.p, pi.p / pi.i) == pytest.approx((1.0, 2.2))
-    pid = by_rule("tyreus_luyben", "pid", 2.2, 6.3)
+    pid = apply_rule("tyreus_luyben", "pid", 2.2, 6.3)
     assert (pid.p, pid.p / pid.i, pid.d / pid.p) == pytest.approx((1.0, 2.2 * 6.3, 1.0))
 
 
@@ -198,7 +198,7 @@ def test_margin_method_rejects_loads_no_worse_than_simc(coefficients, sample_tim
     one = problem(coefficients, sample_time)
     feedback = METHODS["margin"].solve(one)
     peak = loop_margins(one.plant, feedback).sensitivity
-    simc = at_sensitivity(one, METHODS["simc"].solve(one), peak)
+    simc = scale_to_sensitivity(one, METHODS["simc"].solve(one), peak)
     # The scale goes in steps of 1 %.
     assert feedback.i >= 1.01 * simc.i
 
@@ -212,12 +212,12 @@ def test_margin_method_does_not_let_counts_shake_the_wheel_out_of_its_band():
     omega, T = one.omega, 0.01
     control = feedback.response(omega, T)
     through = np.abs(control * one.true_response / (1 + control * one.response)) ** 2
-    shaking = np.sqrt(np.trapezoid(through * one.noise, omega) / omega[-1])
+    speed_noise_factor = np.sqrt(np.trapezoid(through * one.noise, omega) / omega[-1])
     # Four times that is 2 % of half the top speed.
-    assert shaking <= 2.5e-3 * 12 * 34.0 * 1.01
+    assert speed_noise_factor <= 2.5e-3 * 12 * 34.0 * 1.01
 
 
-def shaking(one, feedback) -> float:
+def speed_noise_factor(one, feedback) -> float:
     """Return what noise shakes the wheel by, over the usual limit."""
     through = feedback.response(one.omega, one.loop.sample_time)
     through = through * one.true_response / (1 + through * one.response)
@@ -231,19 +231,19 @@ def test_a_noisy_speed_does_not_leave_a_load_to_itself():
     loop = replace(one.loop, counts_per_revolution=None, difference_window=0, speed_noise=90.0)
     strict = Problem(sample(one.plant.motors, loop), replace(loop, noise_voltage=loop.noise_limit))
     still, found = (METHODS["margin"].solve(p) for p in (strict, replace(strict, loop=loop)))
-    assert shaking(strict, still) <= 1.0
+    assert speed_noise_factor(strict, still) <= 1.0
     # What shakes a slow loop goes with the root of its bandwidth: 1.2^8 squared is 18.
     assert found.i > 10 * still.i
     assert strict.control_noise(found) <= loop.noise_limit
     margins = loop_margins(strict.plant, found)
     assert margins.phase >= 59.9 and margins.sensitivity <= 1.4
-    assert shaking(strict, found) <= 1.2**8
+    assert speed_noise_factor(strict, found) <= 1.2**8
 
 
 def test_speed_noise_stays_at_its_default_limit_if_gains_match_simc():
     one = problem((1 / 34.0, 0.01 / 34.0, 0.019 * 0.01**2 / 34.0), 0.01)
     one = Problem(one.plant, replace(one.loop, counts_per_revolution=24.0))
-    assert shaking(one, METHODS["margin"].solve(one)) <= 1.0
+    assert speed_noise_factor(one, METHODS["margin"].solve(one)) <= 1.0
 
 
 def test_margin_method_rejects_a_load_better_than_a_grid_of_pi_gains():

@@ -22,11 +22,11 @@ from smp_motor_control.wheel.loop import LoopSettings, WheelLoop
 from smp_motor_ident.cli.tuning import read_estimates
 from smp_motor_ident.tune import Design, Loop, design, design_wheels
 from smp_motor_ident.tune.feedback import Feedback
-from smp_motor_ident.tune.motors import motors_of
+from smp_motor_ident.tune.motors import make_motors
 from smp_motor_ident.tune.plant import sample
 from smp_motor_ident.tune.reference import planned_change
 from smp_motor_ident.tune.simulation import Controller, Inputs, simulate
-from smp_motor_ident.tune.writing import parameters, silence, slow_loop
+from smp_motor_ident.tune.writing import describe_slow_loop, parameters, silence
 
 MOTORS = Path(__file__).resolve().parents[2] / "config" / "motors_paper.yaml"
 STEP = 1.2
@@ -77,7 +77,7 @@ def test_the_wheel_loop_applies_the_designed_feed_forward(estimates, share, T, s
         outs.append(out.feedforward)
         references.append(loop.reference.velocity * ratio)
     time = T * np.arange(80)
-    plant = sample(motors_of(estimates["front_left"]), one.loop)
+    plant = sample(make_motors(estimates["front_left"]), one.loop)
     planned = planned_change(plant, one.reference, target, time)
     # Both interpolate linearly between the same samples.
     np.testing.assert_allclose(references, planned.reference, atol=1e-9 * target)
@@ -89,7 +89,7 @@ def test_the_wheel_loop_applies_the_designed_feed_forward(estimates, share, T, s
 
 def test_a_clamped_lead_without_an_error_leaves_the_simulated_integral_alone(estimates):
     """As the running controller, which takes nothing back while a measurement is left alone."""
-    plant = sample(motors_of(estimates["front_left"]), Loop(sample_time=0.005))
+    plant = sample(make_motors(estimates["front_left"]), Loop(sample_time=0.005))
     controller = Controller(Feedback(0.1, 1.0), limit=12.0, tracking=0.01)
     lead = np.where(np.arange(40) < 3, 20.0, 5.0)
     run = simulate(plant, controller, Inputs(np.full(40, -1e9), np.full(40, 1e9), lead))
@@ -172,4 +172,4 @@ def test_gains_for_a_slow_loop_drive_its_wheel(estimates, rate):
         speeds.append(sample.velocity)
     assert begun > 55
     assert np.mean(speeds[-20:]) == pytest.approx(target, rel=0.1)
-    assert bool(slow_loop(one)) is (silence(one.loop) > 0.2)
+    assert bool(describe_slow_loop(one)) is (silence(one.loop) > 0.2)

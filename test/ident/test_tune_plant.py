@@ -12,7 +12,7 @@ from smp_motor_control.pid import Pid, PidGains
 from smp_motor_control.reference.minimum_jerk import MinimumJerk, Reference
 from smp_motor_ident.tune.feedback import Feedback, closed_loop, spectral_radius
 from smp_motor_ident.tune.loop import Loop
-from smp_motor_ident.tune.margins import batch_margins, grid_for, loop_margins
+from smp_motor_ident.tune.margins import batch_margins, loop_margins, make_grid
 from smp_motor_ident.tune.motors import Motors
 from smp_motor_ident.tune.plant import sample
 from smp_motor_ident.tune.simulation import Controller, Inputs, simulate
@@ -146,7 +146,7 @@ def test_margins_agree_with_python_control():
     several = beyond = nyquist = 0
     for _ in range(80):
         plant, feedback = random_loop(rng)
-        omega = grid_for(plant, 2000)
+        omega = make_grid(plant, 2000)
         loop = plant.response(omega)[0] * feedback.response(omega, plant.sample_time)
         gain, phase, least, _, crossings, _ = control.stability_margins(
             control.FRD(loop, omega, smooth=True), returnall=True
@@ -175,7 +175,7 @@ def test_coarse_grid_of_a_batch_reads_the_same_margins():
     rng, errors = np.random.default_rng(1), []
     while len(errors) < 100:
         plant, feedback = random_loop(rng)
-        nominal, omega = loop_margins(plant, feedback), grid_for(plant, 400)
+        nominal, omega = loop_margins(plant, feedback), make_grid(plant, 400)
         if nominal.stable and nominal.sensitivity < 3:
             loop = plant.response(omega) * feedback.response(omega, plant.sample_time)
             batch, names = batch_margins(loop, omega), ("phase", "gain", "delay", "sensitivity")

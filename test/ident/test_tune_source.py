@@ -19,7 +19,7 @@ from smp_motor_ident.finding import Finding
 from smp_motor_ident.result import ChainRecord
 from smp_motor_ident.tune import Loop, design
 from smp_motor_ident.tune.feedback import spectral_radius
-from smp_motor_ident.tune.motors import Motors, motors_of
+from smp_motor_ident.tune.motors import Motors, make_motors
 from smp_motor_ident.tune.plant import sample
 from smp_motor_ident.tune.simulation import Controller, Inputs, simulate
 from smp_motor_ident.tune.source import choose_source
@@ -37,7 +37,7 @@ def observed(rate: float, **more) -> Loop:
 
 
 def test_an_observer_with_the_right_model_sees_the_speed_itself(estimates):
-    motors = motors_of(estimates["front_left"])
+    motors = make_motors(estimates["front_left"])
     loop = observed(200.0, delay=0.01)  # whole samples: the mean voltage is the voltage
     omega = np.geomspace(1.0, 600.0, 50)
     seen = sample(motors, loop).response(omega)
@@ -46,7 +46,7 @@ def test_an_observer_with_the_right_model_sees_the_speed_itself(estimates):
 
 
 def test_the_response_of_a_wrong_model_is_that_of_the_simulated_loop(estimates):
-    believed = motors_of(estimates["front_left"])
+    believed = make_motors(estimates["front_left"])
     actual = Motors(
         1.1 * believed.a0, 0.9 * believed.a1, believed.a2, believed.delay, believed.static_voltage
     )

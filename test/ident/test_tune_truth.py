@@ -17,7 +17,7 @@ from smp_motor_ident.result import ChainRecord, Estimate, Quantity, Share, Syste
 from smp_motor_ident.tune import design
 from smp_motor_ident.tune.feedback import Feedback, spectral_radius
 from smp_motor_ident.tune.margins import batch_margins, loop_margins
-from smp_motor_ident.tune.motors import motors_of
+from smp_motor_ident.tune.motors import make_motors
 from smp_motor_ident.tune.plant import sample
 from smp_motor_ident.tune.problem import Problem
 
@@ -123,7 +123,7 @@ def test_a_second_lag_that_the_record_hides_is_within_the_stated_margins():
         one_lag, combinations={**one_lag.combinations, "time_constant_product": product}
     )
     aware, ignorant = design(hidden, LOOP), design(one_lag, LOOP)
-    motor = motors_of(estimate(time_constant_product=3.5e-4))
+    motor = make_motors(estimate(time_constant_product=3.5e-4))
 
     real, unaware = margins_on(motor, aware), margins_on(motor, ignorant)
     assert real.phase > aware.specification.phase_margin.low > 59.0
@@ -152,7 +152,7 @@ def test_motors_that_the_record_does_not_exclude_keep_the_stated_margins(stated,
     moves = {name: value - known.value(name) for name, value in left_open.items()}
     unseen = Systematic("delay", 1.0, moves)
     aware, ignorant = design(replace(known, systematic=(unseen,)), loop), design(known, loop)
-    true = motors_of(estimate(**{**motor, **other}))
+    true = make_motors(estimate(**{**motor, **other}))
 
     real, unaware = margins_on(true, aware), margins_on(true, ignorant)
     assert real.gain > aware.specification.gain_margin.low
@@ -207,7 +207,7 @@ def test_coarse_counts_cost_no_more_than_the_limits_ask_for():
     """Of PI and PID gains of a dense grid within margins and control noise none is far better."""
     loop = replace(LOOP, counts_per_revolution=48.0, noise_voltage=0.48)
     one = design(estimate(), loop, structure="pi")
-    problem = Problem(sample(motors_of(estimate()), loop), loop)
+    problem = Problem(sample(make_motors(estimate()), loop), loop)
     best = 0.0
     for p in np.geomspace(0.002, 0.3, 40):
         for i in np.geomspace(0.05, 10.0, 40):
@@ -271,6 +271,6 @@ def test_no_gain_margin_is_stated_beyond_the_band_of_the_record():
     loop = replace(LOOP, sample_time=0.001, delay=None, counts_per_revolution=28.0)
     one = design(estimate(time_constant=0.03, time_constant_product=0.0), loop)
     band = one.specification.gain_margin
-    late = motors_of(estimate(time_constant=0.03, time_constant_product=0.0, delay=0.0005))
+    late = make_motors(estimate(time_constant=0.03, time_constant_product=0.0, delay=0.0005))
     true = loop_margins(sample(late, one.loop), one.feedback).gain
     assert 10.0 == band.low < true < 0.97 * band.value

@@ -12,13 +12,13 @@ from smp_motor_ident.errors import DesignError
 from smp_motor_ident.result import Estimate, ModelError, ResidualTests
 from smp_motor_ident.tune import METHODS, Loop, design
 from smp_motor_ident.tune.feedback import Feedback
-from smp_motor_ident.tune.motors import motors_of
+from smp_motor_ident.tune.motors import make_motors
 from smp_motor_ident.tune.plant import sample
 from smp_motor_ident.tune.problem import Problem
 from smp_motor_ident.tune.specification import band
 from smp_motor_ident.tune.unmodelled import (
     UnmodelledDynamics,
-    added_by_resonance,
+    compute_resonance_effect,
     unmodelled_dynamics,
 )
 from smp_motor_ident.tune.writing import gains_document
@@ -112,7 +112,7 @@ def test_recording_that_shows_nothing_is_refused_with_the_reason():
 def test_an_observer_tolerates_more_model_error_outside_its_feedback():
     # The observer's prediction from the voltage depends on the model only.
     loop = replace(LOOP, counts_per_revolution=500.0, speed_source="observer")
-    motors = motors_of(known_up_to(20.0))
+    motors = make_motors(known_up_to(20.0))
     plant = sample(motors, loop)
     omega = np.array([20.0, 300.0])
     z = np.exp(1j * omega * loop.sample_time)
@@ -130,7 +130,7 @@ def test_an_observer_tolerates_more_model_error_outside_its_feedback():
 
 def test_gain_of_unmodelled_dynamics_is_that_of_the_formula():
     one, loop = known_up_to(20.0), replace(LOOP, difference_window=0)
-    plant = sample(motors_of(one), loop)
+    plant = sample(make_motors(one), loop)
     problem = Problem(plant, loop, {}, unmodelled_dynamics(one))
     feedback = Feedback(0.05, 0.5)
     C = feedback.response(problem.omega, loop.sample_time)
@@ -175,8 +175,10 @@ def test_the_effect_of_a_resonance_equals_that_of_a_simulated_one():
     T = 0.002
     reference = minimum_jerk(T, 0.2, 2500)
     unknown = UnmodelledDynamics(np.array([20.0, 1000.0]), np.array([1e3, 1e3]))
-    plant = sample(motors_of(known_up_to(20.0)), replace(LOOP, sample_time=T, difference_window=0))
-    more, longer = added_by_resonance(unknown, plant, Feedback(0.0, 0.0), reference)
+    plant = sample(
+        make_motors(known_up_to(20.0)), replace(LOOP, sample_time=T, difference_window=0)
+    )
+    more, longer = compute_resonance_effect(unknown, plant, Feedback(0.0, 0.0), reference)
     behind = [resonant(reference, w, T, 0.05) for w in (20.0, 23.0, 27.0, 32.0, 40.0, 60.0)]
     all_of_them = [*behind, *(2 * reference - y for y in behind)]
     # A fiftieth: between the frequencies and dampings that are tried.
@@ -210,8 +212,8 @@ def test_every_resonance_within_the_bound_stays_within_its_stated_effect():
     one = known_up_to(20.0)
     volts = minimum_jerk(T, 0.08, 400) / 25.0
     usual = looped(0 * s, feedback, volts, T)[0]
-    plant = sample(motors_of(one), loop)
-    more, longer = added_by_resonance(unmodelled_dynamics(one), plant, feedback, usual)
+    plant = sample(make_motors(one), loop)
+    more, longer = compute_resonance_effect(unmodelled_dynamics(one), plant, feedback, usual)
     omega = np.geomspace(0.5, np.pi / T, 2000)
     weight = np.interp(np.log(omega), np.log(FREQUENCY), [0.05] * 5 + [2.0] * 4, right=2.0)
     added, ends = [], []
@@ -231,11 +233,11 @@ def test_every_resonance_within_the_bound_stays_within_its_stated_effect():
 
 
 def test_nothing_is_added_where_all_is_known():
-    plant, feedback = sample(motors_of(known_up_to(600.0)), LOOP), Feedback(0.02, 0.3)
+    plant, feedback = sample(make_motors(known_up_to(600.0)), LOOP), Feedback(0.02, 0.3)
     answer = minimum_jerk(0.005, 0.1, 100)
-    assert added_by_resonance(None, plant, feedback, answer) == (0.0, 0.0)
+    assert compute_resonance_effect(None, plant, feedback, answer) == (0.0, 0.0)
     known = UnmodelledDynamics(np.array([1.0, 700.0]), np.array([0.01, 0.01]))
-    assert added_by_resonance(known, plant, feedback, answer)[0] < 0.01
+    assert compute_resonance_effect(known, plant, feedback, answer)[0] < 0.01
 
 
 def test_bands_hold_a_resonance_that_the_recording_does_not_show():

@@ -57,7 +57,7 @@ def drive(one, entry=ENTRY, load=0.0, late=0.0, wait=0.0, offset=0.0):
         even[kept],
     )
     specification = asdict(one.specification)
-    return v.change_of(
+    return v.read_change(
         WHEEL, "forward", setpoint, even[kept], speed[kept] + offset * setpoint, rows,
         specification, v.resolution(turn, STEP),
     )  # fmt: skip
@@ -128,13 +128,15 @@ def test_how_long_a_command_waited_is_seen_in_the_voltages_that_were_applied():
     latest = np.array([np.flatnonzero(arrived <= t + 1e-9)[-1:] for t in time[:-1]], dtype=object)
     voltage = np.array([0.0] + [float(commands[k[0]]) if k.size else 0.0 for k in latest])
     loop = {"delay": 0.0, "supply_voltage": 12.0}
-    delays = v.arrival_delays((time, ages, commands), (time, voltage), loop)
+    delays = v.measure_arrival_delays((time, ages, commands), (time, voltage), loop)
     # Before the first nothing was; the last two were not in effect when the record ended.
     np.testing.assert_allclose(delays[1:-2], (arrived - time)[1:-2], atol=1e-9)
     measured = voltage + rng.normal(0.0, 1.0, voltage.size)
-    said = v.arrival_delays((time, ages, commands), (time, measured), loop)
+    said = v.measure_arrival_delays((time, ages, commands), (time, measured), loop)
     assert np.array_equal(said, ages)
-    slower = v.arrival_delays((time, ages, commands), (time, measured), {**loop, "delay": STEP})
+    slower = v.measure_arrival_delays(
+        (time, ages, commands), (time, measured), {**loop, "delay": STEP}
+    )
     assert np.array_equal(slower, np.full(time.size, STEP))
 
 
@@ -147,7 +149,7 @@ def test_a_command_inside_the_dead_zone_of_a_driver_has_not_waited():
     applied = np.where(np.abs(commands) < 1.5, 0.0, commands)
     voltage = np.concatenate(([0.0], applied[:-1]))
     loop = {"delay": 0.0, "supply_voltage": 12.0}
-    delays = v.arrival_delays((time, ages, commands), (time, voltage), loop)
+    delays = v.measure_arrival_delays((time, ages, commands), (time, voltage), loop)
     assert delays[1:].max() <= STEP + 1e-9
 
 

@@ -36,7 +36,7 @@ class _CsvFile(Tables):
 
     def __init__(self, path: Path, name: str, budget: Budget) -> None:
         super().__init__(path, name)
-        self._lines = _text(path).splitlines()
+        self._lines = _decode_text(path).splitlines()
         filled = (k for k, s in enumerate(self._lines) if s.strip() and not s.startswith(_COMMENTS))
         seen = list(islice(filled, _EXAMINED_ROWS))
         if not seen:
@@ -46,26 +46,26 @@ class _CsvFile(Tables):
         if all(self._lines[k].rstrip().endswith(";") for k in seen):
             self._lines = [s.rstrip().removesuffix(";") for s in self._lines]
         if any(self._lines[k].lstrip().startswith("[") for k in seen):
-            self._lines = [_without_brackets(s) for s in self._lines]
+            self._lines = [_strip_brackets(s) for s in self._lines]
         usual = self._lines[seen[len(seen) // 2]]
         if _ARROW in usual:  # behind a serial monitor's time of arrival
             mark = next((c for c in ";\t," if c in usual), " ")
             self._lines = [s.replace(_ARROW, mark) for s in self._lines]
-        labels, seen = self._labels(seen)
-        self._separator = _separator([self._lines[k] for k in seen])
-        rows = [_row(self._lines[k], self._separator) for k in seen]
-        if self._separator == " ":
+        labels, seen = self._split_labels(seen)
+        self._find_separator = _find_separator([self._lines[k] for k in seen])
+        rows = [_split_row(self._lines[k], self._find_separator) for k in seen]
+        if self._find_separator == " ":
             rows = [
                 self._split_names(self._lines[k], row, len(rows[len(rows) // 2]))
                 for k, row in zip(seen, rows)
             ]
         self._grid = grid.head(rows, str(path))
         self._first = seen[self._grid.first]
-        above = [labels] if labels else self._commented(len(rows[self._grid.first]))
+        above = [labels] if labels else self._read_comment_header(len(rows[self._grid.first]))
         if above and not self._grid.named:
             self._grid = grid.head([*above, *rows[self._grid.first :]], str(path))
         self.problems += self._grid.findings
-        self._words = self._numbered()
+        self._words = self._number_motor_names()
         known = grid.numeric(self._grid.names, rows[self._grid.first :])
         self._numeric = tuple(n for n in self._grid.names if n in known or n in self._words)
 
@@ -74,12 +74,12 @@ class _CsvFile(Tables):
         units, words = self._grid.units, self._words
         return [Channel(0, "", "", TABLE, fields=self._numeric, units=units, words=words)]
 
-    def _numbered(self) -> dict[str, tuple[str, ...]]:
+    def _number_motor_names(self) -> dict[str, tuple[str, ...]]:
         """Replace the words of columns that name motors by numbers; return the words."""
         found = {}
         # Single letters may be words of any column
         for j in [j for j, name in enumerate(self._grid.names) if separates_motors(name, "A")]:
-            rows = {k: _row(s, self._separator) for k, s in enumerate(self._lines)}
+            rows = {k: _split_row(s, self._find_separator) for k, s in enumerate(self._lines)}
             body = {k: row for k, row in rows.items() if k >= self._first and j < len(row)}
             words = grid.words([row[j].strip() for row in body.values()])
             if words and separates_motors(self._grid.names[j], words):
@@ -87,8 +87,8 @@ class _CsvFile(Tables):
                 for k, row in body.items():
                     if row[j].strip() in words:
                         row[j] = str(words.index(row[j].strip()))
-                        quoted = (f'"{c}"' if self._separator in c else c for c in row)
-                        self._lines[k] = self._separator.join(quoted)
+                        quoted = (f'"{c}"' if self._find_separator in c else c for c in row)
+                        self._lines[k] = self._find_separator.join(quoted)
         return found
 
     def table(self, topic: str, fields: Sequence[str]) -> Table:
@@ -101,7 +101,7 @@ class _CsvFile(Tables):
             return Table(None, None, dict(zip(fields, fast)))
         body = self._lines[self._first :]
         lines = [k for k, s in enumerate(body, self._first + 1) if not s.startswith("#")]
-        rows = [_row(s, self._separator) for s in body if not s.startswith("#")]
+        rows = [_split_row(s, self._find_separator) for s in body if not s.startswith("#")]
         values, findings, dates = grid.columns(rows, use, fields, str(self.path), lines)
         columns = dict(zip(fields, values))
         return Table(None, None, columns, findings=findings, exact=frozenset(dates))
@@ -111,7 +111,7 @@ class _CsvFile(Tables):
         try:
             values = np.loadtxt(
                 (f"{line}\n" for line in islice(self._lines, self._first, None)),
-                delimiter=None if self._separator == " " else self._separator,
+                delimiter=None if self._find_separator == " " else self._find_separator,
                 usecols=use,
                 ndmin=2,
                 quotechar='"',
@@ -122,7 +122,7 @@ class _CsvFile(Tables):
             return None
         return [values[:, k].copy() for k in range(len(use))]
 
-    def _labels(self, seen: list[int]) -> tuple[list[str], list[int]]:
+    def _split_labels(self, seen: list[int]) -> tuple[list[str], list[int]]:
         """Take the labels off rows that have one before every number; return them and such rows."""
         usual = self._lines[seen[len(seen) // 2]]
         if len(usual) > _MAX_LABELLED_ROW:
@@ -148,27 +148,27 @@ class _CsvFile(Tables):
         apart = re.split(r"\s{2,}", line.strip())
         return apart if len(apart) == width else []
 
-    def _commented(self, width: int) -> list[list[str]]:
+    def _read_comment_header(self, width: int) -> list[list[str]]:
         """Return the comments right above the numbers that name columns, and their units."""
         above: list[list[str]] = []
         for line in reversed(self._lines[: self._first]):
             text = line.strip()
             if not text.startswith(_COMMENTS):
                 break
-            cells = self._cells(text.lstrip("#%/ \t"), width)
+            cells = self._split_comment(text.lstrip("#%/ \t"), width)
             if not cells or grid.is_data(cells):
                 break
             above.insert(0, cells)
         return above[-2:]
 
-    def _cells(self, text: str, width: int) -> list[str]:
+    def _split_comment(self, text: str, width: int) -> list[str]:
         """Return the cells of a comment where it has as many as the rows, none of them empty."""
-        marks = [*self._separator.strip(), *";\t|,", *[None][: self._separator == " "]]
+        marks = [*self._find_separator.strip(), *";\t|,", *[None][: self._find_separator == " "]]
         several = [[cell.strip(' \t"') for cell in text.split(mark)] for mark in marks]
         return next((c for c in several if len(c) == width and all(c)), [])
 
 
-def _without_brackets(line: str) -> str:
+def _strip_brackets(line: str) -> str:
     """Return a row of a matrix or of lists without its brackets."""
     text = line.strip().removesuffix(";").removesuffix("]")
     return text[1:] if text[:1] == "[" and text[1:2].strip("0123456789.+-") == "" else text
@@ -179,7 +179,7 @@ def _strip_labels(line: str) -> str:
     return _UNIT.sub("", _LABEL.sub("", line))
 
 
-def _row(line: str, separator: str) -> list[str]:
+def _split_row(line: str, separator: str) -> list[str]:
     if separator == " ":
         return line.split()
     try:
@@ -196,16 +196,16 @@ def _is_quoted_row(line: str) -> bool:
     return not grid.is_data([text[1:-1]]) and any(mark in text for mark in ";\t|, ")
 
 
-def _separator(lines: list[str]) -> str:
+def _find_separator(lines: list[str]) -> str:
     """Return the separator that splits most lines into numbers; a comma may be decimal."""
     usual = lines[len(lines) // 2 :]
     likely = [c for c in ";\t|," if sum(c in line for line in usual) > 2 / 3 * len(usual)]
     likely += [" "] if any(" " in line.strip() for line in usual) else []
-    sound = {c: sum(grid.share_of_numbers(_row(line, c)) for line in usual) for c in likely}
+    sound = {c: sum(grid.share_of_numbers(_split_row(line, c)) for line in usual) for c in likely}
     return max(sound, key=lambda c: sound[c], default=",")
 
 
-def _text(path: Path) -> str:
+def _decode_text(path: Path) -> str:
     """Return a file's text in any encoding that spreadsheets and scopes write."""
     data = path.read_bytes()
     if data[:2] in (b"\xff\xfe", b"\xfe\xff"):

@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from smp_motor_ident.bag.readers.format import check_width
-from smp_motor_ident.bag.storage import found
-from smp_motor_ident.bag.units import written_unit
+from smp_motor_ident.bag.storage import make_finding
+from smp_motor_ident.bag.units import parse_unit
 from smp_motor_ident.errors import BagError
 from smp_motor_ident.finding import Finding
 from smp_motor_ident.limits import MAX_STRAY_ROW_SHARE
@@ -60,18 +60,18 @@ def head(rows: Sequence[Row], where: str) -> Grid:
         raise BagError(f"{where}: has no rows of numbers; give a table of samples")
     width = len(seen[first])
     check_width(width, where)
-    above = [row for row in seen[:first] if sum(not _empty(c) for c in row) > width / 2]
+    above = [row for row in seen[:first] if sum(not _is_empty(c) for c in row) > width / 2]
     if not above:
         names = [f"c{k}" for k in range(1, width + 1)]
         text = f"{where}: has no row of names; its columns are called {names[0]} to {names[-1]}"
-        return Grid(names, {}, first, [found("no_column_names", text)])
+        return Grid(names, {}, first, [make_finding("no_column_names", text)])
     named, given = above[-1], [""] * width
-    if len(above) > 1 and all(_empty(c) or written_unit(_bare(c)) is not None for c in above[-1]):
-        named, given = above[-2], [_bare(c) for c in above[-1]]
+    if len(above) > 1 and all(_is_empty(c) or parse_unit(_strip(c)) is not None for c in above[-1]):
+        named, given = above[-2], [_strip(c) for c in above[-1]]
     units: dict[str, str] = {}
     columns: dict[str, int] = {}
     for k in range(width):
-        text = str(named[k]).strip() if k < len(named) and not _empty(named[k]) else f"c{k + 1}"
+        text = str(named[k]).strip() if k < len(named) and not _is_empty(named[k]) else f"c{k + 1}"
         text = (
             text[:_MAX_NAME_LENGTH]
             if text[:_MAX_NAME_LENGTH] not in columns
@@ -79,8 +79,8 @@ def head(rows: Sequence[Row], where: str) -> Grid:
         )
         columns[text] = k
         bracket = _BRACKETS.search(text)
-        unit = written_unit(given[k] if k < len(given) else "") or (
-            written_unit(bracket[1]) if bracket else None
+        unit = parse_unit(given[k] if k < len(given) else "") or (
+            parse_unit(bracket[1]) if bracket else None
         )
         if unit or str(seen[first][k]).endswith("%"):
             units[text] = unit or "%"
@@ -90,9 +90,9 @@ def head(rows: Sequence[Row], where: str) -> Grid:
 def numeric(names: Sequence[str], rows: Sequence[Row]) -> tuple[str, ...]:
     """Return the names of the columns with numbers."""
     filled = [[row[k] for row in rows if k < len(row)] for k in range(len(names))]
-    filled = [[cell for cell in column if not _empty(cell)] for column in filled]
+    filled = [[cell for cell in column if not _is_empty(cell)] for column in filled]
     return tuple(
-        name for name, cells in zip(names, filled) if not cells or any(map(_readable, cells))
+        name for name, cells in zip(names, filled) if not cells or any(map(_is_convertible, cells))
     )
 
 
@@ -100,25 +100,21 @@ def words(cells: Sequence[str]) -> tuple[str, ...]:
     """Return the words of a column without outliers; none for numbers, states or one word."""
     counts = Counter(filter(None, cells))
     usual = tuple(c for c, n in counts.items() if n > MAX_STRAY_ROW_SHARE * len(cells))
-    if (
-        len(usual) < 2
-        or any(map(_is_readable_cell, usual))
-        or all(c.lower() in _WORDS for c in usual)
-    ):
+    if len(usual) < 2 or any(map(_is_number, usual)) or all(c.lower() in _WORDS for c in usual):
         return ()
     return usual
 
 
-def without_unit(name: str) -> str:
+def strip_unit(name: str) -> str:
     """Return a column's name without the unit in brackets behind it."""
     return _BRACKETS.sub("", name)
 
 
-def _empty(cell: Any) -> bool:
+def _is_empty(cell: Any) -> bool:
     return cell is None or not str(cell).strip()
 
 
-def _bare(cell: Any) -> str:
+def _strip(cell: Any) -> str:
     return str(cell).strip().strip("[]()")
 
 
@@ -129,15 +125,15 @@ def is_data(row: Row) -> bool:
 
 def share_of_numbers(row: Row) -> float:
     """Return the share of numbers among a row's cells that are not empty."""
-    sound = [_is_readable_cell(cell) for cell in row[:_MAX_EXAMINED] if not _empty(cell)]
+    sound = [_is_number(cell) for cell in row[:_MAX_EXAMINED] if not _is_empty(cell)]
     return sum(sound) / max(len(sound), 1)
 
 
-def _is_readable_cell(cell: Any) -> bool:
-    return _readable(cell) and not (isinstance(cell, str) and cell.strip().lower() in _WORDS)
+def _is_number(cell: Any) -> bool:
+    return _is_convertible(cell) and not (isinstance(cell, str) and cell.strip().lower() in _WORDS)
 
 
-def _readable(cell: Any) -> bool:
+def _is_convertible(cell: Any) -> bool:
     try:
         number(cell)
     except ValueError:
@@ -196,7 +192,7 @@ def columns(
     sound_rows: list[Row] = []
     last = 0  # row of numbers
     for k, row in enumerate(rows):
-        if all(_empty(cell) for cell in row):
+        if all(_is_empty(cell) for cell in row):
             continue
         try:
             kept.extend([number(row[j]) if j < len(row) else np.nan for j in use])
@@ -214,14 +210,14 @@ def columns(
     findings = []
     if stray:
         text = f"{where}: {len(stray)} rows without numbers were left out, the first in line "
-        findings.append(found("stray_rows", f"{text}{lines[stray[0]]}", "warning"))
+        findings.append(make_finding("stray_rows", f"{text}{lines[stray[0]]}", "warning"))
     values = np.array(kept).reshape(len(sound_rows), len(use))
-    exact = [_whole(sound_rows, j, values[:, n]) for n, j in enumerate(use)]
+    exact = [_convert(sound_rows, j, values[:, n]) for n, j in enumerate(use)]
     dates = {name for name, (_, timed) in zip(names, exact) if timed}
     return [column for column, _ in exact], findings, dates
 
 
-def _whole(rows: Sequence[Row], j: int, column: NDArray[Any]) -> tuple[NDArray[Any], bool]:
+def _convert(rows: Sequence[Row], j: int, column: NDArray[Any]) -> tuple[NDArray[Any], bool]:
     """Return a column, as integers if float64 would round it, and whether it holds times."""
     if not column.size or not np.isfinite(column).all():
         return column, False

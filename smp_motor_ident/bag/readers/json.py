@@ -22,8 +22,8 @@ from numpy.typing import NDArray
 
 from smp_motor_ident.bag.readers import grid
 from smp_motor_ident.bag.readers.format import ColumnFile, Format
-from smp_motor_ident.bag.storage import damaged, found
-from smp_motor_ident.bag.units import UNITS, needs, written_unit
+from smp_motor_ident.bag.storage import make_finding, report_damage
+from smp_motor_ident.bag.units import UNITS, needs, parse_unit
 from smp_motor_ident.bag.unpack import Budget
 from smp_motor_ident.errors import BagError
 from smp_motor_ident.finding import Finding
@@ -33,19 +33,19 @@ _TESTS = ("slow-forward", "slow-backward", "fast-forward", "fast-backward")
 _ONE_MOTOR = ("Simple", "Arm", "Elevator")
 _SIGNALS = ("voltage", "position", "velocity")
 _SIDES = tuple(f"{side}_{what}" for what in _SIGNALS for side in ("left", "right"))
-_OLD = ("time", "battery", "autospeed")
+_FORERUNNER_COLUMNS = ("time", "battery", "autospeed")
 _FORMS = {
     **dict.fromkeys(((True, 4), (False, 4)), ("time", *_SIGNALS)),
     (True, 9): ("time", *_SIDES, "angle", "angular_rate"),
-    (False, 6): (*_OLD, *_SIGNALS),
-    (False, 9): (*_OLD, *_SIDES),
-    (False, 10): (*_OLD, *_SIDES, "gyro"),
+    (False, 6): (*_FORERUNNER_COLUMNS, *_SIGNALS),
+    (False, 9): (*_FORERUNNER_COLUMNS, *_SIDES),
+    (False, 10): (*_FORERUNNER_COLUMNS, *_SIDES, "gyro"),
 }
 """Names of the columns by their number: of SysId, or of its forerunner."""
-_TOLERANCE = 0.01  # of a file's units per rotation
-_DEEPEST = 16
-_WIDEST = 64
-_MOST_CELLS = 5_000_000
+_UNITS_TOLERANCE = 0.01  # of a file's units per rotation
+_MAX_DEPTH = 16
+_MAX_ELEMENTS = 64
+_MAX_CELLS = 5_000_000
 
 
 def _open(path: Path, name: str, budget: Budget) -> ColumnFile:
@@ -53,38 +53,38 @@ def _open(path: Path, name: str, budget: Budget) -> ColumnFile:
     try:
         text = path.read_text("utf-8-sig")
     except UnicodeDecodeError as error:
-        raise BagError(f"{name}: no readable JSON ({_reason(error)})") from None
-    document, problem = _parsed(text, name, whole=path.suffix.lower() == ".json")
+        raise BagError(f"{name}: no readable JSON ({_describe_error(error)})") from None
+    document, problem = _parse(text, name, whole=path.suffix.lower() == ".json")
     units: dict[str, str] = {}
     dates: set[str] = set()
     radius = 0.0
     problems: list[Finding] = []
     if isinstance(document, Mapping) and any(test in document for test in _TESTS):
-        columns, units, radius, problems = _sysid(document, name)
+        columns, units, radius, problems = _read_sysid(document, name)
     else:
         try:
             columns = dict(islice(_columns("", document, 0, dates), round(MAX_COLUMNS) + 1))
         except RecursionError:
             raise BagError(f"{name}: is nested too deeply") from None
-    problems += [damaged(problem)] if problem else []
+    problems += [report_damage(problem)] if problem else []
     return ColumnFile(path, name, columns, units, dates, problems, radius)
 
 
-def _parsed(text: str, name: str, *, whole: bool) -> tuple[Any, str]:
+def _parse(text: str, name: str, *, whole: bool) -> tuple[Any, str]:
     """Return the content of a text and a remark on errors; accept JSON lines in ``.json``."""
     reason = ""
     if whole:
         try:
             return json.loads(text), ""
         except (ValueError, RecursionError) as error:
-            reason = _reason(error)
+            reason = _describe_error(error)
     try:
-        return _lines(text, name)
+        return _parse_lines(text, name)
     except (ValueError, RecursionError) as error:
-        raise BagError(f"{name}: no readable JSON ({reason or _reason(error)})") from None
+        raise BagError(f"{name}: no readable JSON ({reason or _describe_error(error)})") from None
 
 
-def _lines(text: str, name: str) -> tuple[list[Any], str]:
+def _parse_lines(text: str, name: str) -> tuple[list[Any], str]:
     """Return the objects of JSON lines; the last line may be cut off."""
     lines = list(filter(None, map(str.strip, text.splitlines())))
     try:
@@ -108,7 +108,7 @@ def _columns(
     prefix: str, value: Any, depth: int, dates: set[str]
 ) -> Iterator[tuple[str, NDArray[Any]]]:
     """Yield the columns of a document by their paths."""
-    if depth > _DEEPEST:
+    if depth > _MAX_DEPTH:
         return
     if isinstance(value, Mapping):
         for key, inner in value.items():
@@ -119,8 +119,8 @@ def _columns(
         return
     cells: dict[str, list[Any]] = {}
     for k, row in enumerate(value):
-        for key, cell in _flat(prefix, row, depth):
-            if key in cells or (len(cells) + 1) * len(value) < _MOST_CELLS:
+        for key, cell in _flatten(prefix, row, depth):
+            if key in cells or (len(cells) + 1) * len(value) < _MAX_CELLS:
                 column = cells.setdefault(key, [])
                 column.extend([None] * (k - len(column)))
                 column.append(cell)
@@ -136,33 +136,33 @@ def _columns(
         except BagError:
             continue  # a column of words
         if values[0].size != len(value):  # missing values are no empty rows here
-            values = [np.array([_number(cell) for cell in column])]
+            values = [np.array([_convert_number(cell) for cell in column])]
         yield key, values[0]
         dates |= timed
 
 
-def _number(cell: Any) -> float:
+def _convert_number(cell: Any) -> float:
     try:
         return grid.number(cell)
     except (ValueError, OverflowError):
         return np.nan
 
 
-def _flat(prefix: str, row: Any, depth: int) -> Iterator[tuple[str, Any]]:
+def _flatten(prefix: str, row: Any, depth: int) -> Iterator[tuple[str, Any]]:
     """Yield the numbers of one row by their paths."""
-    if depth > _DEEPEST:
+    if depth > _MAX_DEPTH:
         return
     if isinstance(row, Mapping):
         for key, inner in row.items():
-            yield from _flat(f"{prefix}.{key}" if prefix else str(key), inner, depth + 1)
+            yield from _flatten(f"{prefix}.{key}" if prefix else str(key), inner, depth + 1)
     elif isinstance(row, list):
-        for k, inner in enumerate(row[:_WIDEST]):
-            yield from _flat(f"{prefix}[{k}]", inner, depth + 1)
+        for k, inner in enumerate(row[:_MAX_ELEMENTS]):
+            yield from _flatten(f"{prefix}[{k}]", inner, depth + 1)
     else:
         yield prefix or "value", row
 
 
-def _sysid(
+def _read_sysid(
     document: Mapping[str, Any], name: str
 ) -> tuple[dict[str, NDArray[Any]], dict[str, str], float, list[Finding]]:
     """Return the joined columns of all tests, their units, the wheel's radius and findings.
@@ -187,14 +187,14 @@ def _sysid(
     columns = {key: table[:, k] for k, key in enumerate(form)}
     if str(document.get("test", "Drivetrain")) in _ONE_MOTOR and "left_voltage" in columns:
         columns = {k.removeprefix("left_"): c for k, c in columns.items() if "right" not in k}
-    unit = written_unit(str(document.get("units", ""))) or ""
+    unit = parse_unit(str(document.get("units", ""))) or ""
     unit = unit if unit in UNITS["position"] else ""
     rim = needs("position", unit, "wheel_radius")
     problems = []
     right = 2 * np.pi / UNITS["position"][unit].factor if unit and not rim else factor
-    if document.get("unitsPerRotation") and abs(factor / right - 1) > _TOLERANCE:
+    if document.get("unitsPerRotation") and abs(factor / right - 1) > _UNITS_TOLERANCE:
         text = f"{name}: says {factor:g} {unit} per rotation, which has {right:g}; correct it"
-        problems.append(found("units_per_rotation", text, "warning", stated=factor))
+        problems.append(make_finding("units_per_rotation", text, "warning", stated=factor))
         factor = right
     units = {}
     for key in columns:
@@ -206,7 +206,7 @@ def _sysid(
     return columns, units, factor * metres / (2 * np.pi), problems
 
 
-def _reason(error: BaseException) -> str:
+def _describe_error(error: BaseException) -> str:
     return "nested too deeply" if isinstance(error, RecursionError) else str(error)[:200]
 
 

@@ -13,15 +13,15 @@ import numpy as np
 from smp_motor_ident.bag.readers.format import Format, Messages
 from smp_motor_ident.bag.salvage import salvage
 from smp_motor_ident.bag.storage import Batch, Channel, join, message_type
-from smp_motor_ident.bag.unpack import Budget, folder_of
+from smp_motor_ident.bag.unpack import Budget, make_temporary_folder
 from smp_motor_ident.errors import BagError
 
 MAGIC = b"SQLite format 3\0"
-_ROWS = 8192
-_ROW = 64  # minimum size of a row [byte]
+_MAX_BLOCK_ROWS = 8192
+_MIN_ROW_BYTES = 64  # minimum size of a row [byte]
 _TABLES = ("topics", "messages", "message_definitions")
-_BEFORE = -(2**63)
-_BLOCK = 1 << 25
+_BEFORE_FIRST_ID = -(2**63)
+_MAX_BLOCK_BYTES = 1 << 25
 
 
 class _SqliteFile(Messages):
@@ -30,7 +30,7 @@ class _SqliteFile(Messages):
     def __init__(self, path: Path, name: str, budget: Budget) -> None:
         super().__init__(path, name, budget)
         self._cut_off = False
-        self._path_read = self._with_journal()
+        self._path_read = self._apply_journal()
         self._database = self._connect(self._path_read)
         try:
             self._topics = self._read_channels()
@@ -38,7 +38,7 @@ class _SqliteFile(Messages):
             reasons = "; ".join([" ".join(str(error).split()), *(p.message for p in self.problems)])
             raise BagError(f"{self.name}: not a readable bag ({reasons})") from None
 
-    def _with_journal(self) -> Path:
+    def _apply_journal(self) -> Path:
         """Return the file, or a copy with its journal applied if one lies next to it.
 
         A killed recorder leaves its last messages there, and SQLite must write to apply them.
@@ -47,10 +47,10 @@ class _SqliteFile(Messages):
         journals = [path for path in beside if path.is_file() and path.stat().st_size]
         if not journals:
             return self.path
-        copy = folder_of(self) / self.path.name
+        copy = make_temporary_folder(self) / self.path.name
         for original in (self.path, *journals):
             shutil.copyfile(original, copy.with_name(original.name))
-        self._amiss(f"was not closed; its journal {journals[0].name} was applied to a copy")
+        self._add_damage(f"was not closed; its journal {journals[0].name} was applied to a copy")
         return copy
 
     def _connect(self, path: Path) -> sqlite3.Connection:
@@ -66,7 +66,7 @@ class _SqliteFile(Messages):
         page = 65536 if page == 1 else page
         pages = int.from_bytes(head[28:32], "big")
         if path == self.path and size < pages * page:
-            self._amiss(f"cut off at byte {size} of {pages * page} that it had")
+            self._add_damage(f"cut off at byte {size} of {pages * page} that it had")
             self._cut_off = True
             # With this, SQLite reads a file shorter than stated in its header.
             database.execute("PRAGMA writable_schema=ON")
@@ -87,7 +87,7 @@ class _SqliteFile(Messages):
                 for kind, *given in self._database.execute(f"{query} FROM message_definitions"):
                     definitions[message_type(kind)] = tuple(given)
             except sqlite3.DatabaseError as error:
-                self._amiss(f"its definitions cannot be read ({error})")
+                self._add_damage(f"its definitions cannot be read ({error})")
         names = ("serialization_format", "offered_qos_profiles")
         optional = ", ".join(name if name in columns else "''" for name in names)
         rows = self._database.execute(f"SELECT id, name, type, {optional} FROM topics ORDER BY id")
@@ -108,36 +108,40 @@ class _SqliteFile(Messages):
         asked = {channel.id: channel for channel in self._topics if wanted(channel)}
         if not asked:
             return
-        last = _BEFORE
+        last = _BEFORE_FIRST_ID
         try:
             if self._cut_off:
                 raise sqlite3.DatabaseError("cut off")
-            for last, batches in self._reads(asked):  # noqa: B007 (where damage begins)
+            for last, batches in self._read_blocks(asked):  # noqa: B007 (where damage begins)
                 yield batches
         except sqlite3.DatabaseError as error:
             if not self._cut_off:
-                where = "before its first message" if last == _BEFORE else f"behind message {last}"
-                self._amiss(f"damaged {where} ({error})")
+                where = (
+                    "before its first message"
+                    if last == _BEFORE_FIRST_ID
+                    else f"behind message {last}"
+                )
+                self._add_damage(f"damaged {where} ({error})")
             for rows in salvage(self._path_read):  # of single pages, after the last of the tree
                 wanted_rows = [row for row in rows if row[0] > last and row[1] in asked]
                 self._budget.take(sum(len(row[3]) for row in wanted_rows))
                 if wanted_rows:
                     yield self._split(wanted_rows, asked)
 
-    def _reads(self, asked: dict[int, Channel]) -> Iterator[tuple[int, list[Batch]]]:
+    def _read_blocks(self, asked: dict[int, Channel]) -> Iterator[tuple[int, list[Batch]]]:
         """Yield the number of the last row, and a block of rows by topic."""
         ids = ",".join(str(key) for key in asked)
         among = "" if len(asked) == len(self._topics) else f"AND topic_id IN ({ids}) "
         query = (
             "SELECT id, topic_id, timestamp, data FROM messages "
-            f"WHERE id > ? {among}ORDER BY id LIMIT {_ROWS}"
+            f"WHERE id > ? {among}ORDER BY id LIMIT {_MAX_BLOCK_ROWS}"
         )
-        last = _BEFORE
-        while rows := self._rows(query, last):
+        last = _BEFORE_FIRST_ID
+        while rows := self._read_rows(query, last):
             last = rows[-1][0]
             yield last, self._split(rows, asked)
 
-    def _rows(self, query: str, last: int) -> list[tuple[int, int, int, bytes]]:
+    def _read_rows(self, query: str, last: int) -> list[tuple[int, int, int, bytes]]:
         """Return the next rows; damaged pages may give the same bytes to many of them."""
         rows, size = [], 0
         for row in self._database.execute(query, (last,)):
@@ -146,9 +150,9 @@ class _SqliteFile(Messages):
             last = row[0]
             rows.append(row)
             size += len(row[3]) if isinstance(row[3], (bytes, str)) else 0
-            if size > _BLOCK:
+            if size > _MAX_BLOCK_BYTES:
                 break
-        self._budget.take(size + _ROW * len(rows))
+        self._budget.take(size + _MIN_ROW_BYTES * len(rows))
         return rows
 
     def _split(
@@ -161,7 +165,7 @@ class _SqliteFile(Messages):
             joined = join(every, list(blobs), np.array(times, np.int64))
         except (TypeError, OverflowError):
             sound = [r for r in rows if isinstance(r[3], bytes) and isinstance(r[2], int)]
-            self._amiss(f"{len(rows) - len(sound)} messages without data were left out")
+            self._add_damage(f"{len(rows) - len(sound)} messages without data were left out")
             return self._split(sound, asked) if sound else []
         which = {key: np.flatnonzero(np.array(keys, np.int64) == key) for key in asked}
         return [replace(joined.take(k), channel=asked[key]) for key, k in which.items() if k.size]

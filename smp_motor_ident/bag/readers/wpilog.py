@@ -16,7 +16,7 @@ import numpy as np
 
 from smp_motor_ident.bag.readers.format import Format, Tables, check_width
 from smp_motor_ident.bag.storage import TABLE, Channel, Table
-from smp_motor_ident.bag.units import written_unit
+from smp_motor_ident.bag.units import parse_unit
 from smp_motor_ident.bag.unpack import Budget
 from smp_motor_ident.errors import BagError
 
@@ -57,7 +57,7 @@ class _Wpilog(Tables):
             c = b + 1 + (sizes >> 4 & 7)
             size = int.from_bytes(data[a:b], "little")
             if c + size > end:
-                self._amiss(f"cut off at byte {at} of {end}")
+                self._add_damage(f"cut off at byte {at} of {end}")
                 return
             key = int.from_bytes(data[at + 1 : a], "little")
             if key == 0:
@@ -125,7 +125,7 @@ def _unit(metadata: str) -> str:
             metadata = str(json.loads(metadata).get("unit", ""))
         except (ValueError, RecursionError):
             return ""
-    return written_unit(metadata) or ""
+    return parse_unit(metadata) or ""
 
 
 FORMAT = Format("WPILib data log", (".wpilog",), MAGIC, _Wpilog)

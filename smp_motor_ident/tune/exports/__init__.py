@@ -31,7 +31,7 @@ def export(
         head.append(
             f"{wheel} at {wheels.designs[wheel].loop.rate:.4g} Hz: phase margin {m.phase:.0f} deg, "
             f"gain margin {m.gain:.2f}, Ms {m.sensitivity:.2f}; an abrupt change by half of the "
-            f"largest speed {_settles(one)}, overshoot {step.overshoot:.2g} %"
+            f"largest speed {_describe_settling(one)}, overshoot {step.overshoot:.2g} %"
         )
         head.extend(f"  {words}" for words in wheels.designs[wheel].warnings)
     # A backslash at its end would make the next line a comment, too
@@ -39,7 +39,7 @@ def export(
     return text + target.render(wheels.designs, gains), checks
 
 
-def _settles(one: Check) -> str:
+def _describe_settling(one: Check) -> str:
     if one.resting_error > SETTLING_BAND:
         return f"rests within {100 * one.resting_error:.1f} % of it, as whole numbers allow"
     if math.isnan(one.step.settling):

@@ -11,7 +11,7 @@ from smp_motor_ident.tune.designer import Design
 from smp_motor_ident.tune.exports.target import (
     Format,
     Gains,
-    present_error,
+    absorb_present_error,
     rounded,
     ticks,
     top_speed,
@@ -109,7 +109,7 @@ def _convert_linorobot2(design: Design) -> Gains:
     loop, T = design.loop, design.loop.sample_time
     # PWM per RPM of the wheel, from volts per rad/s of the motor.
     scale = (2**PWM_BITS - 1) / loop.supply_voltage * loop.gear_ratio * 2 * math.pi / 60
-    wanted = present_error(design.feedback, T)
+    wanted = absorb_present_error(design.feedback, T)
     p, i = rounded(max(wanted.p, 0.0) * scale), rounded(wanted.i * T * scale)
     feedback = Feedback((p + i) / scale, i / T / scale)
     return Gains({"K_P": p, "K_I": i, "K_D": 0.0}, feedback)
@@ -275,7 +275,7 @@ ROS_ARDUINO_BRIDGE = Format(
 def _convert_arduino_pid(design: Design) -> Gains:
     loop, T = design.loop, design.loop.sample_time
     scale = MAX_PWM / loop.supply_voltage * loop.gear_ratio
-    wanted = present_error(design.feedback, T)
+    wanted = absorb_present_error(design.feedback, T)
     p, i = rounded(max(wanted.p, 0.0) * scale), rounded(wanted.i * scale)
     feedback = Feedback((p + i * T) / scale, i / scale)
     numbers = {"Kp": p, "Ki": i, "Kd": 0.0, "SampleTime": whole_milliseconds(loop)}

@@ -66,7 +66,7 @@ class Check:
 MILLISECOND = 1e-3  # tolerance for whole milliseconds, since rates have six digits
 
 
-def plant_of(design: Design) -> Plant:
+def sample_plant(design: Design) -> Plant:
     """Return the sampled motor that a design is for, in its loop."""
     a0 = 1 / design.motor["dc_gain"]
     a1, a2 = a0 * design.motor["time_constant"], a0 * design.motor["time_constant_product"]
@@ -77,7 +77,7 @@ def plant_of(design: Design) -> Plant:
 
 def check(design: Design, gains: Gains) -> Check:
     """Compute margins and step response of the loop that the target runs."""
-    loop, plant = design.loop, plant_of(design)
+    loop, plant = design.loop, sample_plant(design)
     target = STEP_SHARE * design.reference.max_velocity
     steps = int(duration(design, gains) / loop.sample_time)
     time = loop.sample_time * np.arange(steps, dtype=np.float64)
@@ -108,7 +108,7 @@ def duration(design: Design, gains: Gains) -> float:
     return float(0.5 + 12 * rise + tail)
 
 
-def present_error(feedback: Feedback, sample_time: float) -> Feedback:
+def absorb_present_error(feedback: Feedback, sample_time: float) -> Feedback:
     """Return the gains for an integral that includes the present error.
 
     ``p e + I + i T e`` is ``(p + i T) e + I``, which contains part of the proportional gain.

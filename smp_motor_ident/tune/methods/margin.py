@@ -39,7 +39,7 @@ _Found = tuple[Feedback, float]
 
 
 @dataclass(frozen=True, eq=False)
-class _Candidates:
+class _Gains:
     p: Array
     i: Array
     d: Array
@@ -58,7 +58,7 @@ def _solve(problem: Problem) -> Feedback:
         raise DesignError(f"phase_margin is {margin:g} deg; it must be below 90")
     peak = problem.target("maximum_sensitivity", 1.4, least=1.0)
     if "bandwidth" in problem.targets and problem.targets["bandwidth"] is not None:
-        return _at_bandwidth(problem, problem.target("bandwidth", 1.0), margin, peak)
+        return _solve_bandwidth(problem, problem.target("bandwidth", 1.0), margin, peak)
     found = _search(problem, margin, peak, focus)
     found = _match_simc(problem, found, margin, peak, focus)
     if found is None:
@@ -104,7 +104,7 @@ def _match_simc(
         if trial is None:
             return 0.0
         sensitivity = float(np.abs(problem.closed(trial[0])[1]).max())
-        return trial[0].i / at_sensitivity(problem, rule, sensitivity).i
+        return trial[0].i / scale_to_sensitivity(problem, rule, sensitivity).i
 
     best, most = found, better(found)
     steps = 1.2 ** np.arange(1, MAX_NOISE_RAISES + 1)
@@ -119,13 +119,13 @@ def _match_simc(
     for step in steps:
         if most >= SPEED_NOISE_TARGET:
             break
-        trial = _search(replace(problem, shaking=float(step)), margin, peak, focus)
+        trial = _search(replace(problem, speed_noise_factor=float(step)), margin, peak, focus)
         if trial is not None and (best is None or trial[0].i > 1.02 * best[0].i):
             best, most = trial, better(trial)
     return best
 
 
-def at_sensitivity(problem: Problem, shape: Feedback, peak: float) -> Feedback:
+def scale_to_sensitivity(problem: Problem, shape: Feedback, peak: float) -> Feedback:
     """Scale gains by the largest factor that keeps Ms."""
     factors = np.geomspace(0.01, 4.0, 800)
     base = problem.response * shape.response(problem.omega, problem.loop.sample_time)
@@ -141,7 +141,7 @@ def _search(
     omega = problem.omega
     # Ms leaves at least this phase: less need not be looked for.
     margin = max(margin, 0.95 * math.degrees(2 * math.asin(min(0.5 / peak, 1.0))))
-    shares = np.zeros(1) if problem.structure == "pi" else _SHARES
+    shares = np.zeros(1) if problem.structure == "pi" else _DERIVATIVE_SHARES
     if bandwidth is None:
         crossovers = np.geomspace(omega[0], 0.6 * omega[-1], 60)
     else:
@@ -149,7 +149,7 @@ def _search(
     margins = np.linspace(margin, min(margin + 35, 95), 8, dtype=np.float64)
     best: tuple[Feedback, float] | None = None
     for zoom in (1.0, 0.3, 0.08):
-        found = _best(problem, crossovers, margins, shares, margin, peak, focus)
+        found = _select_candidate(problem, crossovers, margins, shares, margin, peak, focus)
         if found is None:
             return best
         best = found[0], found[1]
@@ -163,10 +163,10 @@ def _search(
     return best
 
 
-_SHARES = np.array([0.0, 0.15, 0.3, 0.45, 0.6, 0.8, 1.0])
+_DERIVATIVE_SHARES = np.array([0.0, 0.15, 0.3, 0.45, 0.6, 0.8, 1.0])
 
 
-def _best(
+def _select_candidate(
     problem: Problem,
     crossovers: Array,
     margins: Array,
@@ -178,7 +178,7 @@ def _best(
     c = _candidates(problem, crossovers, margins, shares)
     if c.p.size == 0:
         return None
-    good = _hold(problem, c, margin, peak, MAX_COMPLEMENTARY_PEAK[focus])
+    good = _filter(problem, c, margin, peak, MAX_COMPLEMENTARY_PEAK[focus])
     merit = np.where(good, c.crossover if focus == "tracking" else c.i, -np.inf)
     for k in np.argsort(-merit)[:20]:
         if not good[k]:
@@ -191,7 +191,7 @@ def _best(
     return None
 
 
-def _candidates(problem: Problem, crossovers: Array, margins: Array, shares: Array) -> _Candidates:
+def _candidates(problem: Problem, crossovers: Array, margins: Array, shares: Array) -> _Gains:
     """Return the gains with the given crossover and phase."""
     T = problem.loop.sample_time
     w, pm, share = (x.ravel() for x in np.meshgrid(crossovers, margins, shares, indexing="ij"))
@@ -205,10 +205,10 @@ def _candidates(problem: Problem, crossovers: Array, margins: Array, shares: Arr
     i = rest.imag / integral.imag
     p = rest.real - i * integral.real
     keep = (i > 0) & (p >= 0)
-    return _Candidates(*(x[keep] for x in (p, i, d, filter_time, w, pm, share)))
+    return _Gains(*(x[keep] for x in (p, i, d, filter_time, w, pm, share)))
 
 
-def _hold(problem: Problem, c: _Candidates, margin: float, peak: float, hump: float) -> Array:
+def _filter(problem: Problem, c: _Gains, margin: float, peak: float, hump: float) -> Array:
     """Return which candidates keep margins, the hump of T, unmodelled dynamics, control noise."""
     omega, T = problem.omega, problem.loop.sample_time
     integral, derivative = terms(omega, T, c.filter_time[:, None])
@@ -226,12 +226,12 @@ def _hold(problem: Problem, c: _Candidates, margin: float, peak: float, hump: fl
     near = np.abs(np.abs(loop) - 1) < 0.1
     good &= np.where(near, np.abs(np.angle(-loop)), np.pi).min(axis=1) >= np.deg2rad(0.9 * margin)
     good &= problem.noise_rms(control * back) <= problem.loop.noise_limit
-    shaking = problem.noise_rms(control * back * problem.true_response)
+    speed_noise = problem.noise_rms(control * back * problem.true_response)
     top = problem.loop.supply_voltage / float(problem.plant.motors.a0[0])
-    return np.asarray(good & (shaking <= problem.shaking * MAX_SPEED_NOISE * top))
+    return np.asarray(good & (speed_noise <= problem.speed_noise_factor * MAX_SPEED_NOISE * top))
 
 
-def _at_bandwidth(problem: Problem, wished: float, margin: float, peak: float) -> Feedback:
+def _solve_bandwidth(problem: Problem, wished: float, margin: float, peak: float) -> Feedback:
     nyquist = math.pi / problem.loop.sample_time
     found = None
     if wished < nyquist:

@@ -30,7 +30,7 @@ def read_oscillation(
     stretches: Sequence[tuple[Array, Array]], sample_time: float
 ) -> tuple[float, float]:
     """Return ultimate gain and period of a relay oscillation, by stretches of voltage and speed."""
-    switches = [_settled(voltage) for voltage, _ in stretches]
+    switches = [_find_switches(voltage) for voltage, _ in stretches]
     lengths = np.concatenate([[], *map(np.diff, switches)])
     if lengths.size < MIN_CYCLES:
         raise DesignError(
@@ -44,7 +44,7 @@ def read_oscillation(
     for begins, signals in zip(switches, stretches, strict=True):
         steady = np.abs(np.diff(begins) - usual) <= CYCLE_TOLERANCE * usual
         for k in np.flatnonzero(steady[:-1] & steady[1:]):
-            sent, answered = (_fundamental(x[begins[k] : begins[k + 2]]) for x in signals)
+            sent, answered = (_compute_fundamental(x[begins[k] : begins[k + 2]]) for x in signals)
             power += abs(sent) ** 2
             cross += answered * sent.conjugate()
     if alike.size < MIN_CYCLES or power == 0:
@@ -57,13 +57,13 @@ def read_oscillation(
     return power / abs(cross), float(alike.mean()) * sample_time
 
 
-def _settled(voltage: Array) -> NDArray[np.int64]:
+def _find_switches(voltage: Array) -> NDArray[np.int64]:
     """Return the samples at which a relay switches up, without those of the transient."""
     switches = np.flatnonzero((voltage[:-1] <= 0) & (voltage[1:] > 0)) + 1
     return switches[min(switches.size // 3, TRANSIENT_CYCLES) :]
 
 
-def _fundamental(two_cycles: Array) -> complex:
+def _compute_fundamental(two_cycles: Array) -> complex:
     """Return the component of a period of half the length; the window has no mean or harmonics."""
     n = two_cycles.size
     time = np.arange(n)

@@ -36,14 +36,14 @@ def _solve_simc(problem: Problem) -> Feedback:
     return Feedback(p, p / min(model.time_constant, 4 * (wished + model.delay)))
 
 
-def _from_ultimate(problem: Problem, rule: str) -> Feedback:
-    ruled = by_rule(rule, problem.structure or "pi", *problem.ultimate)
+def _solve_ultimate(problem: Problem, rule: str) -> Feedback:
+    ruled = apply_rule(rule, problem.structure or "pi", *problem.ultimate)
     if not ruled.d:
         return ruled
     return replace(ruled, filter_time=problem.filter_time(ruled.filter_time))
 
 
-def by_rule(rule: str, structure: str, gain: float, period: float) -> Feedback:
+def apply_rule(rule: str, structure: str, gain: float, period: float) -> Feedback:
     """Apply a rule to an ultimate point without a model."""
     share, integral, derivative = RULES[rule, structure]
     p, td = share * gain, derivative * period
@@ -63,7 +63,7 @@ ZIEGLER_NICHOLS = Method(
     "Ziegler-Nichols from the ultimate point",
     "Ziegler and Nichols 1942",
     RequiredMargins(phase=20.0, gain=1.5, sensitivity=3.5),
-    lambda problem: _from_ultimate(problem, "ziegler_nichols"),
+    lambda problem: _solve_ultimate(problem, "ziegler_nichols"),
     ("structure",),
 )
 TYREUS_LUYBEN = Method(
@@ -71,6 +71,6 @@ TYREUS_LUYBEN = Method(
     "Tyreus-Luyben from the ultimate point",
     "Tyreus and Luyben 1992",
     RequiredMargins(phase=30.0, gain=2.0, sensitivity=2.2),
-    lambda problem: _from_ultimate(problem, "tyreus_luyben"),
+    lambda problem: _solve_ultimate(problem, "tyreus_luyben"),
     ("structure",),
 )

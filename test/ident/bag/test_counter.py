@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from recordings import COUNTS, RATIO, motion, notes, read
 
 from smp_motor_ident.bag import read_records
-from smp_motor_ident.bag.counter import Wrap, is_full, round_to_counts, unwrap, unwrap_angle
+from smp_motor_ident.bag.counter import Wrap, find_full_count, round_to_counts, unwrap, unwrap_angle
 from smp_motor_ident.errors import BagError
 from smp_motor_ident.record import Record
 
@@ -320,9 +320,9 @@ def test_an_angle_that_toggles_is_not_unwrapped():
 def test_a_counter_that_stays_at_the_end_of_its_width_is_full(last):
     true = (np.arange(400) * last) // 300
     clipped = np.minimum(true, last) if last > 0 else np.maximum(true, last)
-    assert is_full(clipped) == last
-    assert is_full(clipped[:302]) == 0, "it is there for two samples only"
-    assert is_full(clipped - 3) == 0, "no width ends there"
+    assert find_full_count(clipped) == last
+    assert find_full_count(clipped[:302]) == 0, "it is there for two samples only"
+    assert find_full_count(clipped - 3) == 0, "no width ends there"
 
 
 def test_an_angle_that_begins_anew_at_each_run_of_a_joined_log_begins_a_segment(tmp_path):

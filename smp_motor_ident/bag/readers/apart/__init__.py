@@ -12,14 +12,14 @@ from smp_motor_ident.bag.unpack import Budget
 from smp_motor_ident.errors import BagError
 
 PROGRAM = Path(__file__).parent / "program.py"
-PATIENCE, PER_BYTE = 15.0, 1e-6
+TIMEOUT_S, TIMEOUT_PER_BYTE_S = 15.0, 1e-6
 """Longest time to read a file [s], and addition per byte."""
 
 
 def read(kind: str, path: Path, name: str, budget: Budget) -> tuple[dict[str, Any], io.BytesIO]:
     """Return the program's description of a file, and its data."""
     command = [sys.executable, str(PROGRAM), kind, str(path), str(budget.left)]
-    patience = PATIENCE + PER_BYTE * path.stat().st_size
+    patience = TIMEOUT_S + TIMEOUT_PER_BYTE_S * path.stat().st_size
     try:
         done = subprocess.run(command, capture_output=True, check=False, timeout=patience)
     except subprocess.TimeoutExpired:

@@ -18,12 +18,14 @@ from typing import Any, cast
 
 import numpy as np
 
-_HEAD = 128  # bytes of a file of version 5 before its first variable
-_DEEPEST = 16
-_WIDEST = 64  # columns of a matrix that are taken as signals; a wider one is something else
-_MOST_ROWS = 1_048_576  # of a sheet, by Excel's own limits
-_UNBOUND = resource.getrlimit(resource.RLIMIT_AS)[1]
-_SLACK = 1 << 26  # memory that readers need in addition to the file's contents [byte]
+_HEADER_BYTES = 128  # bytes of a file of version 5 before its first variable
+_MAX_DEPTH = 16
+_MAX_MATRIX_COLUMNS = (
+    64  # columns of a matrix that are taken as signals; a wider one is something else
+)
+_MAX_SHEET_ROWS = 1_048_576  # of a sheet, by Excel's own limits
+_MEMORY_LIMIT = resource.getrlimit(resource.RLIMIT_AS)[1]
+_READER_MEMORY = 1 << 26  # memory that readers need in addition to the file's contents [byte]
 
 
 class Unreadable(Exception):
@@ -51,7 +53,7 @@ def main() -> None:
     except Exception as error:  # libraries raise any error on damaged bytes
         reason = (str(error).splitlines() or [type(error).__name__])[0]
         head["error"] = f"no readable {kind} file ({reason[:200]})"
-    resource.setrlimit(resource.RLIMIT_AS, (_UNBOUND, _UNBOUND))
+    resource.setrlimit(resource.RLIMIT_AS, (_MEMORY_LIMIT, _MEMORY_LIMIT))
     sys.stdout.buffer.write(json.dumps(head).encode() + b"\n")
     sys.stdout.buffer.writelines(parts)
 
@@ -87,8 +89,10 @@ def _workbook(path: Path, memory: int) -> Iterator[Part]:
         sheet.reset_dimensions()  # the stated width may be wrong
         lines = []
         for k, row in enumerate(sheet.iter_rows()):
-            if k >= _MOST_ROWS:
-                raise Unreadable(f"says that it has more than the {_MOST_ROWS:,} rows of a sheet")
+            if k >= _MAX_SHEET_ROWS:
+                raise Unreadable(
+                    f"says that it has more than the {_MAX_SHEET_ROWS:,} rows of a sheet"
+                )
             if row and (cells := _cells(row)):
                 lines.append(json.dumps(cells).encode() + b"\n")
                 left -= len(lines[-1])
@@ -155,19 +159,19 @@ def _contents(data: bytes, objects: list[str], memory: int) -> Iterator[dict[str
 def _bound_memory(memory: int) -> None:
     """Limit the memory this process may take in addition to its present use."""
     pages = int(Path("/proc/self/statm").read_text().split()[0])
-    limit = pages * resource.getpagesize() + memory + _SLACK
-    resource.setrlimit(resource.RLIMIT_AS, (limit, _UNBOUND))
+    limit = pages * resource.getpagesize() + memory + _READER_MEMORY
+    resource.setrlimit(resource.RLIMIT_AS, (limit, _MEMORY_LIMIT))
 
 
 def _variables(data: bytes) -> Iterator[bytes]:
     """Yield every variable as a file of its own: scipy gives all objects one and the same name."""
-    order = "<" if data[126:_HEAD] == b"IM" else ">"
-    at = _HEAD
+    order = "<" if data[126:_HEADER_BYTES] == b"IM" else ">"
+    at = _HEADER_BYTES
     while at + 8 <= len(data):
         size = struct.unpack_from(order + "I", data, at + 4)[0]
         if at + 8 + size > len(data):
             raise Unreadable(f"is cut off at byte {at} of {len(data)}; save it again")
-        yield data[:_HEAD] + data[at : at + 8 + size]
+        yield data[:_HEADER_BYTES] + data[at : at + 8 + size]
         at += 8 + size
 
 
@@ -177,7 +181,7 @@ def _columns(
     """Yield the vectors of a structure by their paths; note its objects."""
     parts = _parts(prefix, value)
     if parts is not None:
-        for path, inner in parts if depth < _DEEPEST else []:
+        for path, inner in parts if depth < _MAX_DEPTH else []:
             yield from _columns(path, inner, depth + 1, objects)
         return
     if not isinstance(value, np.ndarray):
@@ -192,7 +196,7 @@ def _columns(
         yield prefix, value
     elif value.ndim == 2:
         rows = value if value.shape[0] >= value.shape[1] else value.T
-        if rows.shape[1] <= _WIDEST:
+        if rows.shape[1] <= _MAX_MATRIX_COLUMNS:
             for k in range(rows.shape[1]):
                 yield f"{prefix}[{k}]", rows[:, k]
 
@@ -202,7 +206,10 @@ def _parts(prefix: str, value: Any) -> list[tuple[str, Any]] | None:
     if isinstance(value, Mapping):
         return [(f"{prefix}.{k}" if prefix else str(k), inner) for k, inner in value.items()]
     if isinstance(value, list) or (isinstance(value, np.ndarray) and value.dtype == object):
-        return [(f"{prefix}[{k}]", inner) for k, inner in enumerate(np.ravel(value)[:_WIDEST])]
+        return [
+            (f"{prefix}[{k}]", inner)
+            for k, inner in enumerate(np.ravel(value)[:_MAX_MATRIX_COLUMNS])
+        ]
     return None
 
 
