@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Each component of the catalogue and each stage of the estimator left out in turn.
+"""Leave out each component of the catalogue and each stage of the estimator in turn.
 
 Every so many records of `frozen`, without the costliest fifth, are estimated with everything and
 again without one thing.  For a component, records with its effect in middle strength are added, and
@@ -82,7 +82,7 @@ def identified(job: frozen.Job, patches: list[Patch] | tuple[()] = ()) -> dict[s
 
 
 def fitted(name: str, row: dict[str, Any]) -> bool:
-    """Tell whether something took part in a record; each current sensor always does."""
+    """Return whether something took part in a record; each current sensor always does."""
     one = find_component(name)
     begun = one and {f"fitting {one.title}", f"beginning again with {one.title}"} & set(row["said"])
     current = one in search.CURRENT_SENSORS and row["about"].endswith(" current")

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Every accuracy table, short, compared with the version before the redesign.
+"""Run every accuracy table in a short form, and compare it with the baseline.
 
     python benchmarks/accuracy.py [--table NAME ...] [--write]
 

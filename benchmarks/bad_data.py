@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Records of random motors, sound and damaged: faults named and faults missed.
+"""Identify sound and damaged records of random motors: faults named and faults missed.
 
 Motor, rate, wave, amplitude, encoder, noise and available signals are drawn at random.
 
@@ -126,7 +126,7 @@ def saturated_current(record: Record, rng: np.random.Generator) -> Record | None
 
 
 def dead_encoder(record: Record, rng: np.random.Generator) -> Record | None:
-    """Stop whatever tells the motion, from the start or from somewhere on."""
+    """Freeze all sensors of the motion, from the start or later."""
     n = int(rng.choice([0, 0, len(record) // 4, len(record) // 2]))
     held = {}
     for name in ("count", "position", "velocity"):
@@ -138,14 +138,14 @@ def dead_encoder(record: Record, rng: np.random.Generator) -> Record | None:
 
 
 def swapped_leads(record: Record, rng: np.random.Generator) -> Record | None:
-    """Turn the motion round."""
+    """Reverse the motion."""
     for name in ("count", "position", "velocity"):
         record = _scaled(record, name, -1)
     return record
 
 
 def swapped_channels(record: Record, rng: np.random.Generator) -> Record | None:
-    """Turn only the counts round."""
+    """Reverse only the counts."""
     return (
         _scaled(record, "count", -1)
         if record.count is not None and record.velocity is not None
@@ -154,7 +154,7 @@ def swapped_channels(record: Record, rng: np.random.Generator) -> Record | None:
 
 
 def swapped_current(record: Record, rng: np.random.Generator) -> Record | None:
-    """Turn the current round."""
+    """Reverse the current."""
     return _scaled(record, "current", -1) if record.current is not None else None
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One wheel's loop, simulated by fixed small steps: shares no code with the designer.
+"""Simulate the loop of one wheel by small fixed steps; shares no code with the designer.
 
 Motor by its physical equations (Runge-Kutta), encoder as floored counts, PID written from the
 published contract of the running controller, voltage clamp, anti-windup, transport delay.

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Random motors over two decades around Table 1, from an independent simulator, from cold.
+"""Identify random motors over two decades around Table 1, from an independent simulator.
 
-Each motor is one line of a file, so that a long run may be stopped and taken up again:
+Each motor is one line of a file, so an interrupted run can be resumed:
 
     python benchmarks/cold_start.py [--motors 200] [--seconds 6] [--rate 1000] [--lines FILE.jsonl]
 """
@@ -37,7 +37,7 @@ def motor(rng: np.random.Generator) -> tuple[float, ...]:
 
 
 def answer(record, motor) -> dict:
-    """Return the tool's result for the record, and the worst error of its claims."""
+    """Return the result for a record, with the largest error of its numbers."""
     begun = time.process_time()
     try:
         e = estimate(record)
@@ -58,7 +58,7 @@ def answer(record, motor) -> dict:
 
 
 def run(args) -> list[dict]:
-    """Return all lines, those of the file first, those still to do appended to it."""
+    """Return all lines: those of the file, then new ones, which are appended to it."""
     path = Path(args.lines) if args.lines else None
     lines = [json.loads(x) for x in path.read_text().splitlines()] if path and path.exists() else []
     done = {(x["case"], x["n"]) for x in lines}

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""``commission`` on robots drawn at random, some of them wired or supplied wrongly.
+"""Run ``commission`` on random robots, some of them wired or supplied wrongly.
 
     python benchmarks/commission_draws.py                      # forty robots
     python benchmarks/commission_draws.py --draws 12 --seed 3
@@ -39,7 +39,7 @@ RIGHT: dict[str, tuple[bool, str]] = {
     "weak battery": (False, "supply_low"),
     "load on one wheel": (False, "friction_outlier"),
 }
-"""By case whether gains may pass, and the finding, of the spoilt wheel, that else is the reason."""
+"""By case: whether gains may pass, and the finding at the faulty wheel that explains a stop."""
 
 
 def motors(draw: random.Random) -> dict[str, dict[str, float]]:

@@ -3,14 +3,13 @@
 
     python benchmarks/commission_kills.py                   # fifty kills, seed of the day
     python benchmarks/commission_kills.py --kills 5 --seed 3
-    python benchmarks/commission_kills.py --kills 30 --resume   # and gone on with to the end
+    python benchmarks/commission_kills.py --kills 30 --resume   # and resumed to the end
 
-Each time one of the tool's processes (the tool, ``excite``, ``record``) drawn at random is hit by
-SIGKILL, SIGTERM or SIGINT. What must hold: the motors get 0 V within 0.3 s of the last process
-that drove them, as their samples say; the controllers are active again within 5 s of the tool's
-end; no process of it is left but the guard, and that ends too; no wheel ever hears commands other
-than zero of two writers within 0.2 s. Times are for a machine with a processor to spare: --slack
-gives more.
+Each time SIGKILL, SIGTERM or SIGINT hits one of the tool's processes (the tool, ``excite``,
+``record``) at random. Required: the motors get 0 V within 0.3 s after the last process that drove
+them, by their samples; the controllers are active again within 5 s after the end of the tool; all
+its processes end, the guard last; no wheel receives nonzero commands of two writers within 0.2 s.
+The times are for a machine with an idle processor; --slack extends them.
 """
 
 from __future__ import annotations

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Recordings as other people's simulators write them: right, called unreliable, refused or silent.
+"""Identify recordings of textbook simulators: right, unreliable, refused or silently wrong.
 
-A small midpoint simulator drives random motors by the signals of a textbook.  What varies is the
-log: noise or none, speed, angle or counts, with or without a current; a row's voltage ran before
-the row, after it, or straight from row to row; sometimes the voltage is measured.  ``silent``: a
+A small midpoint simulator drives random motors by the signals of a textbook.  The logs vary: with
+or without noise and current; speed, angle or counts; a voltage that holds before or after its row,
+or changes linearly between rows, and is sometimes measured.  ``silent``: a
 number is off by more than 5 of its standard deviations and 2 %, and nothing is unreliable.
 
 Usage: python benchmarks/conventions.py [--motors 54] [--seed S] [--list]
@@ -135,7 +135,7 @@ def recording(seed: int):
 
 
 def errors(found, true: dict[str, float], top: float) -> dict[str, float]:
-    """Return by how many stated deviations each wrong number is off."""
+    """Return the error of each wrong number in stated standard deviations."""
     r, k = true["resistance"], true["motor_constant"]
     floors = {"static_voltage": 0.005 * top, "coulomb_friction": 0.005 * top * k / r,
               "viscous_friction": 0.02 * k * k / r}  # fmt: skip

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Mean squared error over the Cramer-Rao bound, and coverage of the 95 % intervals.
 
-Every realisation is one line of a file, so that a long run may be stopped and taken up again:
+Every realisation is one line of a file, so an interrupted run can be resumed:
 
     python benchmarks/efficiency.py [--realisations 100] [--torque 0.3] [--lines FILE.jsonl]
 """
@@ -78,7 +78,7 @@ def covariance(
 def whitened(
     columns: np.ndarray, record: Record, motor: MotorParameters, torque: float
 ) -> np.ndarray:
-    """Return columns divided by the root of the noise's covariance, a load's among it."""
+    """Return columns divided by the root of the covariance of noise and load."""
     n = len(record)
     push = np.zeros(n)
     push[1] = torque * motor.motor_constant / motor.resistance
@@ -155,7 +155,7 @@ def cases(args) -> Iterator[tuple[str, str, bool]]:
 
 
 def run(args) -> list[dict]:
-    """Return all lines, those of the file first, those still to do appended to it."""
+    """Return all lines: those of the file, then new ones, which are appended to it."""
     path = Path(args.lines) if args.lines else None
     lines = []
     if path and path.exists():

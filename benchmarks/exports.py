@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Do exported gains do in the target's own arithmetic what their comment says?
+"""Check exported gains in the arithmetic of their target.
 
     python benchmarks/exports.py [--motors 50]
 

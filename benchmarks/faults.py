@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Faults drawn at random against real processes: no forbidden motion, no dead node.
+"""Inject random faults into real processes: no forbidden motion, no dead node.
 
     python benchmarks/faults.py                         # one hour, seed of the day
     python benchmarks/faults.py --minutes 2 --seed 7
@@ -46,7 +46,7 @@ TRY_VOLTAGE = 1.05 * 4.0 + 0.02  # and a step of the PWM
 
 @dataclass(frozen=True)
 class Fault:
-    """What goes wrong: how it begins, whether and by when the wheel must have stopped."""
+    """A fault: its start, and the time by which the wheel must have stopped, if at all."""
 
     name: str
     begin: Callable[[Campaign], None]
@@ -135,7 +135,7 @@ class Campaign:
         return False
 
     def heal(self) -> None:
-        """Take every fault away, as a person does who then calls ~/reset."""
+        """Remove every fault and call ~/reset."""
         self.relay.passes()
         self.robot.setpoint = self.speed
         if self.wheel.poll() is not None:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""``identify --fleet`` on a Dask cluster of two workers against one process: numbers, time, a kill.
+"""Compare ``identify --fleet`` on a Dask cluster with one process: numbers, time, a killed worker.
 
     pip install distributed
     python benchmarks/fleet.py                  # 200 recordings

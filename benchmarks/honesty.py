@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Every case where theory says that a parameter cannot be separated, and where it can.
+"""Compare stated identifiability with theory, case by case.
 
 Theory is the rank of the sensitivities, and at full rank the Cramer-Rao bound: a parameter whose
 bound is above half of its value does not count as separable.

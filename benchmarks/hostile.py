@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Files of at most 10 MB that claim far more than they hold, several for every reader.
+"""Read files of at most 10 MB that claim far more content, several for every reader.
 
     python benchmarks/hostile.py [NAME ...]
 

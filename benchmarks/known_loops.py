@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Motors identified through known firmware loops, from set-points and speeds, against the truth.
+"""Identify motors through known firmware loops, from set-points and speeds.
 
     python benchmarks/known_loops.py                     # 20 random motors a loop
     python benchmarks/known_loops.py --motors 5 --seed 7

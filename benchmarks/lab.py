@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What does the page of ``lab`` cost a robot of four wheels?
+"""Measure the cost of the page of ``lab`` on a robot with four wheels.
 
 The same simulated robot drives alone, and while a page in headless Chromium watches it, in turns.
 Every sample that a wheel answers tells how long its answer took (``age`` of ``PidState``).  A

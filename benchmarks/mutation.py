@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Small changes of the code that keeps wheels and readers safe: which does no test notice?
+"""Run the tests of safety-critical modules on mutants, and list the survivors.
 
     python benchmarks/mutation.py                       # every module of the table, some hours
     python benchmarks/mutation.py pid wheel.faults      # these

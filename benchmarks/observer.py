@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How much quieter is the loop with the observer than with differenced counts?
+"""Compare the noise of the loop with the observer and with differenced counts.
 
 The same gains, so the same bandwidth, once fed with counts differenced over one sample and
 once with the observer, on every motor of the paper with an encoder of 500 counts. The

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The comparison of benchmarks/observer.py on live nodes: motor_plant and one wheel_pid.
+"""Repeat benchmarks/observer.py on live nodes: motor_plant and one wheel_pid.
 
 The plant reports the true speed (velocity_window 0), which the loop does not use; wheel_pid
 makes its speed from counts, differenced over one sample or observed, with the same gains. Its

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Random sets of parameters of a wheel: accepted ones must run and follow.
+"""Draw random parameters of a wheel; accepted ones must run and follow.
 
     python benchmarks/parameter_sets.py 5000 --seed 15
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What people write today to identify a motor, each as its own documentation would have it."""
+"""Identify a motor with other packages, as their documentation recommends."""
 
 from __future__ import annotations
 

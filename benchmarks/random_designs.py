@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Does any ordinary motor at any rate end tune in anything but gains or a reasoned refusal?
+"""Design gains for random motors and loops; anything but gains or a refusal is a crash.
 
     python benchmarks/random_designs.py [--count 5000] [--seed 1] [--jobs 2]
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A bag through ``play`` into ``identifier``: its last answer against the offline intervals.
+"""Play a bag into ``identifier``; compare its last estimates with the offline intervals.
 
     python benchmarks/replay.py demo_output        # of make demo: excitation and identification
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Soak: plant at 200 Hz, four wheel controllers and skid_steer, driving for a long time.
+"""Drive plant, four wheel controllers and skid_steer at 200 Hz for a long time.
 
     python benchmarks/soak.py               # 20 minutes
     python benchmarks/soak.py --minutes 2
@@ -57,7 +57,7 @@ def resident(pid: int) -> int:
 
 
 class Driver:
-    """Drives the robot and keeps what tells of trouble."""
+    """Drives the robot and records problems."""
 
     def __init__(self) -> None:
         import rclpy

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""When the machine itself stood still: a witness on every processor, above all that is measured.
+"""Detect stalls of the machine by a real-time process on every processor.
 
-A virtual machine is now and then not run for some milliseconds.  Nothing in it can keep time
-then, and no counter in it tells.  A process per processor sleeps for a millisecond again and
-again with the highest real-time priority; where it wakes late, no program could have run.
+The host of a virtual machine may pause it for some milliseconds, which no counter inside shows.
+A process per processor sleeps for a millisecond again and again with the highest real-time
+priority; when it wakes late, no other program could have run.
 """
 
 from __future__ import annotations

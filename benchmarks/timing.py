@@ -175,7 +175,7 @@ class Feeder:
         self.forget()
 
     def controls(self, wheel: str) -> bool:
-        """Tell whether the last samples were answered, and not by a zero on its own account."""
+        """Return whether the last samples were answered, and not by a zero on its own account."""
         last = self.sent[wheel][-20:-2]
         return bool(last) and all(at in self.received[wheel] for at in last)
 
@@ -274,7 +274,7 @@ def compare(rate: float, duration: float, repeats: int) -> bool:
 
 
 def real_time_granted() -> bool:
-    """Tell whether this process may ask for SCHED_FIFO."""
+    """Return whether this process may ask for SCHED_FIFO."""
     try:
         os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(stillness.PRIORITY))
     except OSError:

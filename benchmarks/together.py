@@ -1,9 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Do four unlike wheels under uneven load reach their speed at the same time?
+"""Compare the arrival of four different wheels under different loads.
 
-Each motor of the paper is excited and recorded into a bag; identified from that bag; given
-gains designed from the identification; and then asked for one and the same step while each
-wheel carries another load, which no model knows.  Two ways:
+Each motor of the paper is excited and recorded in a bag, identified, and tuned.  All wheels then
+make the same step under different loads that the models do not contain, in two ways:
 
 - plain: the tuned PID acts on the step itself;
 - together: all wheels follow one minimum-jerk reference with the feed-forward of their own
@@ -72,7 +71,7 @@ It moves the free motor by 0.1 % of the step (rms), and increases the overshoot 
 
 @dataclass(frozen=True)
 class Arrival:
-    """How the wheels came to their speed.
+    """Settling and overshoot of the wheels.
 
     Attributes
     ----------
@@ -200,7 +199,7 @@ def drive(
     begin: float = 0.3,
     duration: float = 1.3,
 ) -> dict[str, Run]:
-    """Ask all wheels for the same step, each with its own load."""
+    """Step the set-point of all wheels, each with its own load."""
     runs = {}
     for number, (wheel, entry) in enumerate(entries.items()):
         setpoint = entry.gearbox.to_wheel(SPEED)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Do four unlike wheels arrive together on live nodes?  motor_plant, four wheel_pid, DDS.
+"""Repeat benchmarks/together.py on live nodes: motor_plant, four wheel_pid, DDS.
 
 The motors are identified from a recorded bag (see benchmarks/together.py), the gains and the
 common reference designed by ``design_wheels`` from that, written as ``tune`` writes them, and
@@ -51,7 +51,7 @@ LATE = 1.7
 
 @dataclass(frozen=True)
 class Step:
-    """How the wheels came to speed once.
+    """Settling and overshoot of the wheels in one step.
 
     Attributes
     ----------
@@ -163,7 +163,7 @@ def designed(rate: float, seed: int) -> Mapping[str, Design]:
 
 
 def measure(rate: float, steps: int, seed: int, priority: int) -> tuple[list[Step], float]:
-    """Run the nodes and step; return what came of each step, and the transition [s]."""
+    """Run the nodes and step; return the result of each step, and the transition [s]."""
     designs = designed(rate, seed)
     environment = {
         **os.environ, "ROS_DOMAIN_ID": str(DOMAIN), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Do the designed loops keep the margins they require?  Every method, 4 + N motors, four rates.
+"""Check the margins of designed loops: every method, 4 + N motors, four rates.
 
     python benchmarks/tuning.py [--motors 200] [--jobs 2] [--rates 100 200] [--output FILE]
 
@@ -7,8 +7,8 @@ Finished results are read from FILE, a line of JSON for each motor and rate, so 
 can be resumed.
 
 Each design is run by ``closed_loop``, which shares no code with the designer: counts, clamp and
-delay included.  A margin is confirmed by spending it: at 95 % of gain and delay margin
-the simulated loop must still decay, at 105 % it must not.
+delay included.  With 95 % of the gain or delay margin added
+the simulated loop must still decay, with 105 % it must not.
 """
 
 from __future__ import annotations
@@ -260,7 +260,7 @@ def compare_with_rules(outcome: Outcome, motor, one: Design, conditions, estimat
 
 
 def table(outcomes: list[Outcome]) -> None:
-    """Print what came out."""
+    """Print the results."""
     head = "  ".join(
         f"{h:>9s}"
         for h in ("designed", "stable", "gain mgn", "delay mgn", "required", "draws", "ms/design")
@@ -300,7 +300,7 @@ def row(rate, rule, name, ratios, enough, possible) -> None:
 
 
 def known_and_unknown(rates) -> None:
-    """Print how far gains from combinations are from those of all the true parameters."""
+    """Print the difference between gains from combinations and gains from all true parameters."""
     worst = 0.0
     for motor in TABLE_1.values():
         names = ("resistance", "inductance", "motor_constant", "inertia", "viscous_friction")

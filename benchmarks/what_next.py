@@ -2,8 +2,8 @@
 """Check whether the proposed excitation brings the predicted accuracy.
 
 Each motor of Table 1 is recorded without current and identified, with a proposal for the next
-recording; the proposal is simulated with the `excite` node's own Fourier voltage and identified
-from cold.
+recording; the proposal is simulated with the Fourier voltage of the `excite` node and identified
+again.
 
 Usage: python benchmarks/what_next.py [--accuracy 0.01] [--recordings 5]
 """

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Recordings with the effects of real drives: right, named, refused, or silently wrong.
+"""Identify recordings with the effects of real drives: right, named, refused, silently wrong.
 
 An independent simulator (`world_motor`) records random motors with one of the effects of
-`world_effects` in one of three strengths; every estimate is held against the truth.  ``right``:
+`world_effects` in one of three strengths; every estimate is compared with the truth.  ``right``:
 no number off by more than 5 of its standard deviations and 2 %, and nothing called unreliable;
 ``covered``: so because of the assumed systematic errors of instruments.
 ``cause``: called unreliable, with the effect named; ``other``: with another cause, or none.
@@ -38,7 +38,7 @@ OUTCOMES = ("right", "covered", "cause", "other", "refused", "warned", "silent",
 
 
 def truth(c: Case) -> dict[str, tuple[float, float]]:
-    """Return what each number may be: lowest and highest."""
+    """Return the lowest and highest right value of each number."""
     out = {}
     for name, value in c.motor.truth().items():
         low, high = c.widen.get(name, (1.0, 1.0))
@@ -47,7 +47,7 @@ def truth(c: Case) -> dict[str, tuple[float, float]]:
 
 
 def errors(estimate, c: Case, random: bool = False) -> dict[str, float]:
-    """Return by how many deviations each wrong number is off, of the ``random`` ones or of all."""
+    """Return the error of each wrong number in ``random`` or total standard deviations."""
     wrong = {}
     true = truth(c)
     if not estimate.value("time_constant_product"):
@@ -79,7 +79,7 @@ def segments(time: np.ndarray) -> tuple[int, ...]:
 
 
 def _speaks_of(finding, wrong: dict[str, float]) -> bool:
-    """Tell whether a finding warns, or names every number that is off."""
+    """Return whether a finding warns, or names every number that is off."""
     named = str(finding.evidence.get("of_the_scale", "")).split(", ")
     return finding.severity == "warning" or (bool(wrong) and set(wrong) <= set(named))
 
@@ -136,7 +136,7 @@ def recorded(c: Case, rng: np.random.Generator):
 
 
 def table(judge: Callable[..., tuple[int, str, str]], outcomes: Sequence[str], about: str) -> None:
-    """Judge the cases that the command line asks for, and print how many came out how."""
+    """Judge the requested cases, and print the number of each outcome."""
     parser = argparse.ArgumentParser(description=about)
     parser.add_argument("--motors", type=int, default=3, help="motors an effect")
     parser.add_argument("--seed", type=int, default=None)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What real drives have that the plain motor has not: each effect in three strengths.
+"""Define the effects of real drives, each in three strengths.
 
 An effect changes a `Case` before it is simulated.  ``causes`` are the codes of findings that
 name it rightly; ``expect`` is "answer" where a right answer or a finding is due, "refuse" where
@@ -51,7 +51,7 @@ class Case:
 
 @dataclass(frozen=True)
 class Effect:
-    """A way in which a recording is not a plain motor's."""
+    """One deviation of a drive from the plain motor."""
 
     name: str
     change: Callable[[Case, int], None]

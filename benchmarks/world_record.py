@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""From an effect, a strength and a seed to arrays as somebody would have recorded them."""
+"""Record a simulated drive by effect, strength and seed."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Random motors and the voltages that people drive them with."""
+"""Draw random motors and their excitation."""
 
 from __future__ import annotations
 

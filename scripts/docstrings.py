@@ -22,13 +22,13 @@ SECTIONS = ("Parameters\n", "Returns\n", "Yields\n")
 
 
 def has_sections(node: ast.FunctionDef | ast.ClassDef) -> bool:
-    """Tell whether a function or class is documented in sections."""
+    """Return whether a function or class is documented in sections."""
     doc = ast.get_docstring(node) or ""
     return node.name in PUBLIC or any(section + "-" * 5 in doc for section in SECTIONS)
 
 
 def says_what_it_returns(node: ast.FunctionDef) -> bool:
-    """Tell whether the summary line replaces a Returns section."""
+    """Return whether the summary line replaces a Returns section."""
     decorators = {ast.unparse(decorator) for decorator in node.decorator_list}
     if decorators & {"property", "cached_property", "functools.cached_property"}:
         return True

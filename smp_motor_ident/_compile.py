@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One typed entry point to numba, so that compiled functions keep their signatures for mypy."""
+"""Compile functions by numba with their types kept for mypy, and cache them on the disk."""
 
 from __future__ import annotations
 
@@ -48,8 +48,8 @@ def _stamped(dispatcher: Any) -> Any:
 def _without_typing(cache: Any) -> Callable[[Any, Any], Any]:
     """Return a cache's loader that skips numba's typing and lowering rules.
 
-    Numba registers a few thousand of them before it looks at the disk; machine code that is
-    there needs none of them but memory, and where it is not there the compiler registers them.
+    Numba registers thousands of rules before it looks at the disk.  Cached machine code does not
+    need them, and the compiler registers them anyway.
     """
 
     def load(signature: Any, target: Any) -> Any:
@@ -71,5 +71,5 @@ def compiled(function: F) -> F:
 
 
 def inlined(function: F) -> F:
-    """Compile a function into its callers: for the few that are called at every sample."""
+    """Compile a function into its callers, for functions that run at every sample."""
     return cast(F, _stamped(numba.njit(forceinline=True, **OPTIONS)(function)))

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Compile for this machine before anybody waits for it: ``python -m smp_motor_ident.compilation``.
+"""Compile all functions in advance: ``python -m smp_motor_ident.compilation``.
 
-The results of Python's and numba's compilers stay on the disk next to the modules.  A motor is
-simulated, estimated from each kind of signal and given gains, so every compiled function is called
-with the types of real use.  If all is compiled already, this takes a second.
+Python and numba cache their output next to the modules.  A motor is simulated, estimated from each
+kind of signal and tuned, so every compiled function is called with the types of real use.  If all
+functions are compiled already, this takes a second.
 """
 
 from __future__ import annotations
@@ -21,11 +21,11 @@ from smp_motor_ident.estimate import estimate
 from smp_motor_ident.record import Hardware, Record
 
 STEP, SAMPLES, COUNTS = 0.01, 400, 500.0
-SHORT_SAMPLES = 100  # samples whose estimate takes no longer than loading the compiled functions
+SHORT_SAMPLES = 100  # samples of an estimate that only loads the compiled functions
 MOTOR = MotorParameters(
     resistance=3.0, inductance=0.05, motor_constant=0.03, inertia=1.4e-5, viscous_friction=5e-5
 )
-"""Near the third motor of the paper's Table 1."""
+"""A motor similar to the third one of Table 1 of the paper."""
 
 
 def recording(friction: float, samples: int = SAMPLES) -> Record:
@@ -48,7 +48,7 @@ def recording(friction: float, samples: int = SAMPLES) -> Record:
 
 
 def load() -> None:
-    """Load what estimates of whole records call, for all processes that are forked after it."""
+    """Load the functions of estimates before processes are forked."""
     estimate(recording(1e-3, SHORT_SAMPLES), "electromechanical")
 
 
@@ -63,7 +63,7 @@ def rehearse(signals: str) -> None:
 
 
 def main() -> int:
-    """Compile all, on two cores; return the exit code."""
+    """Compile all functions on two cores; return the exit code."""
     for package in ("smp_motor_control", "smp_motor_ident"):
         compileall.compile_dir(Path(__file__).parents[1] / package, quiet=2)
     with ProcessPoolExecutor(2) as pool:

@@ -40,12 +40,12 @@ class InsufficientExcitationError(SmpError):
 
 
 class UnknownLagError(InsufficientExcitationError):
-    """The data tell a gain and no time constant; ``estimate`` is the answer without one."""
+    """The data determine a gain but no time constant; ``estimate`` is the partial answer."""
 
     estimate: Any = None
 
 
 class DesignError(SmpError):
-    """No gains meet the targets; the message tells the limit and the nearest design."""
+    """No gains meet the targets; the message states the limit and the nearest design."""
 
     exit_code = 1

@@ -14,22 +14,22 @@ SEVERITIES: tuple[Severity, ...] = ("note", "warning", "unreliable", "refused")
 
 @dataclass(frozen=True)
 class Finding:
-    """One thing that was found about data or a result.
+    """One observation about data or a result.
 
     Attributes
     ----------
     code : str
-        Name that programs decide by, such as ``dead_zone``.
+        Name for programs, such as ``dead_zone``.
     severity : {'note', 'warning', 'unreliable', 'refused'}
         ``unreliable``: a stated number may be off by more than its interval.
     message : str
         The observation in words, with values and units.
     evidence : mapping of str to float, str or None
-        The numbers behind it, such as a test statistic and its limit.
+        Numbers of the observation, such as a test statistic and its limit.
     advice : str
-        What to do about it, such as which recording would settle it.
+        What to do, such as a recording that would decide.
     quantities : tuple of str
-        Numbers that it concerns, by the names of `result.UNITS`; empty for all.
+        Affected quantities, by the names of `result.UNITS`; empty for all.
     """
 
     code: str

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Linear algebra of a few columns on one thread: others would only wait for their share of it."""
+"""Run linear algebra on one thread, which is faster for matrices of a few columns."""
 
 from contextlib import AbstractContextManager, nullcontext
 from functools import cache
@@ -9,7 +9,7 @@ from typing import Any
 def one_thread() -> AbstractContextManager[object]:
     """Return a context in which the linear algebra library runs on one thread.
 
-    The programs ask for that before they import it; who imports the package after numpy cannot.
+    The tools set this before they import numpy; a program that imports numpy first needs this.
     """
     pools = _pools()
     return nullcontext() if pools is None else pools.limit(limits=1)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Record: one motor's validated signals, the common input of this package.
+"""Define the record: the validated signals of one motor, the common input of this package.
 
 All quantities are at the motor shaft, before the gearbox; time is in seconds from the
 start of the record.  Records know no files, no topics and no ROS.
@@ -44,7 +44,7 @@ class Hardware:
     voltage_accuracy : float or None
         Relative standard deviation of the recorded voltage against that at the terminals.
     timing_accuracy : float or None
-        Standard deviation [s] of when the instruments read, against the stamp of their row.
+        Standard deviation [s] between the stamp of a row and its readings.
     """
 
     gear_ratio: Positive = 1.0
@@ -78,8 +78,8 @@ class Record:
     count : ndarray of int64, shape (n,), or None
         Unwrapped encoder counts at the motor shaft.
     starts : tuple of int
-        Index at which each segment begins; the first is 0.  Nothing is known about the
-        motor between two segments (a gap, a reset counter), so each has a state of its own.
+        Index at which each segment begins; the first is 0.  The motion between two segments (a gap,
+        a reset counter) is unknown, so each has its own initial state.
     hardware : Hardware
         Gearbox, encoder and supply.
     source : str
@@ -90,7 +90,7 @@ class Record:
         Length [s] of the trailing window over which ``velocity`` is known to be averaged;
         0 where it is instantaneous or unknown.
     recorded : float or None
-        When the recording began [s since 1970], by its own stamps; None where they do not tell.
+        Start of the recording [s since 1970] by its own stamps; None if unknown.
 
     Raises
     ------

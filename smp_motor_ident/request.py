@@ -26,11 +26,11 @@ class Request:
     """The arguments of `estimate`, checked."""
 
     model: str  # ``auto`` or one of `MODELS`
-    known: Mapping[str, float]  # given by the user, the ohmmeter's resistance among it
+    known: Mapping[str, float]  # values given by the user, including an ohmmeter's resistance
     bounds: Mapping[str, tuple[float, float]]  # limits of physical parameters
     loss: str  # one of `LOSSES`
     validation: Sequence[Record] | None  # held-out records
-    say: Callable[[str], None]  # receives in words the step that begins
+    say: Callable[[str], None]  # receives the name of each step
     use_current: bool  # whether the current is an output of the model
     window: float = 0.0  # over which a recorded speed is known to be averaged [s]
 
@@ -69,7 +69,7 @@ class Request:
 
     @property
     def may_leave_current(self) -> bool:
-        """Whether an estimate without the current answers the request."""
+        """Whether the request allows an estimate without the current."""
         return self.use_current and self.model == "auto" and not self.bounds
 
     def without_current(self, group: Sequence[Record]) -> tuple[list[Record], Request]:
@@ -128,8 +128,8 @@ def _check_outputs(group: Sequence[Record]) -> None:
     if speed_alone and no_speed:
         raise ParameterError(
             f"{no_speed.source or 'a record'} has no speed and {speed_alone.source or 'another'} "
-            "neither angle nor counts: records that are estimated together need one of them in "
-            "common; estimate these separately"
+            "neither angle nor counts: records that are estimated together need a common signal; "
+            "estimate these separately"
         )
 
 
@@ -151,7 +151,7 @@ def _check_bounds(
 
 
 def has_current(group: Sequence[Record]) -> bool:
-    """Tell whether a current was measured in enough samples."""
+    """Return whether a current was measured in enough samples."""
     there = [r.current for r in group if r.current is not None]
     finite = sum(int(np.isfinite(c).sum()) for c in there)
     enough = finite > MIN_CURRENT_SHARE * sum(len(r) for r in group)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Result of an estimation: values with their uncertainty, status and reasons.
+"""Define the result of an estimation: values with uncertainty, status and reasons.
 
 Plain data, written to and read from ``identification.json`` without loss.
 """
@@ -57,7 +57,7 @@ QUANTITIES: Mapping[str, tuple[str, str, str, str]] = {
     "coasting_share":
         ("1", "s₀", "Coasting share", "share of back-EMF in the voltage at steady speed"),
 }  # fmt: skip
-"""Unit, symbol, name and meaning of every quantity that a model may report, at the motor shaft."""
+"""Unit, symbol, name and meaning of every quantity, at the motor shaft."""
 UNITS = {name: unit for name, (unit, *_) in QUANTITIES.items()}
 
 
@@ -97,12 +97,12 @@ class Quantity:
     unit : str
         SI unit.
     status : {'estimated', 'fixed', 'unidentifiable'}
-        Where the number comes from.
+        Origin of the number.
     systematic : tuple of Share
         Uncertainties that no recording shows; never part of ``std`` and ``ci95``.
     valid : mapping of str to (float, float), optional
-        Operating points at which the number was observed, such as ``voltage`` [V]; None where it
-        holds at others too.
+        Operating points at which the number was observed, such as ``voltage`` [V]; None if it also
+        holds elsewhere.
     """
 
     value: float | None
@@ -190,7 +190,7 @@ class ChainRecord:
 
 @dataclass(frozen=True)
 class Systematic:
-    """A systematic error and the change of every number that it causes.
+    """A systematic error and its effect on every number.
 
     Attributes
     ----------
@@ -226,16 +226,15 @@ class Estimate:
     covariance : ndarray, shape (p, p)
         Covariance of the estimation error of ``names``, in their own units squared.
     speed_noise : float
-        Standard deviation [rad/s] of the noise on the recorded speed that the model was fitted to;
-        0 where it was fitted to an angle.
+        Standard deviation [rad/s] of the noise on the fitted speed; 0 for a fit to an angle.
     speed_step : float
-        Step [rad/s] in which that speed comes; 0 where it comes in none, or was an angle.
+        Resolution [rad/s] of that speed; 0 without steps, or for an angle.
     angle_noise : float
         Standard deviation [rad] of the noise on the recorded angle, or on the angle whose
         difference is the recorded speed; 0 for counts, whose quantisation is known, and for other
         speeds.
     systematic : tuple of Systematic
-        Errors that no recording shows; ``std``, ``ci95`` and ``covariance`` leave them out.
+        Errors that no recording shows; not part of ``std``, ``ci95`` and ``covariance``.
     chain : ChainRecord
         Components between command and recording, with their values.
     """
@@ -319,7 +318,7 @@ _WRITTEN = (
 
 
 def plain(value: Any) -> Any:
-    """Return data classes and arrays as JSON has them; a number that does not exist is None."""
+    """Return data classes and arrays as plain JSON types; NaN and infinity become None."""
     text = msgspec.json.encode(value, enc_hook=lambda numbers: numbers.tolist())
     return msgspec.json.decode(text)
 

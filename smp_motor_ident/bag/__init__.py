@@ -1,9 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Any robot's recordings as records: the only part of the project that reads and writes bags.
+"""Read the recordings of any robot as records; only this package reads and writes bags.
 
-`read_records` gives one `smp_motor_ident.record.Record` per wheel, whatever the format; a
-mapping says which topics, fields or columns are which signals where the messages are not ours.
-`BagWriter` writes.
+`read_records` returns one `smp_motor_ident.record.Record` per wheel, whatever the format.  A
+mapping assigns topics, fields or columns to signals; messages of `smp_interfaces` need none.
 """
 
 from importlib import import_module
@@ -14,7 +13,7 @@ _HOMES = {
     **dict.fromkeys(("join_records", "read_experiments", "read_records"), "read"),
     **{"Listing": "topics", "list_topics": "propose", "BagWriter": "writer"},
 }
-"""Public names, each imported when it is first asked for: who writes needs no reader."""
+"""Module of each public name, imported on first use: a writer loads no reader."""
 
 
 def __getattr__(name: str) -> Any:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Make one motor's Record from columns: units, clock, order, repairs, segments."""
+"""Make the record of one motor from columns: units, clock, order, repairs, segments."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -118,12 +118,12 @@ def _check_series(motor: Context, series: dict[str, Series]) -> None:
             if last := counter.find_full_count(value):
                 raise BagError(
                     f"{motor.where}: the count stays at {last}, the end of a counter's range: "
-                    "it is full; record a wider one, or one that wraps"
+                    "it is saturated; record a wider counter, or one that wraps"
                 )
             if checks.has_two_publishers(value.astype(np.float64)):
                 raise BagError(
-                    f"{motor.where}: the count jumps to and fro between two courses, so that two "
-                    "nodes published it at once; end one of them and record anew"
+                    f"{motor.where}: the count jumps to and fro between two counters, so that two "
+                    "nodes published it at once; stop one of them and record again"
                 )
             count = unwrap_counts(motor, series).count
             value = (count - count[:1]).astype(np.float64)
@@ -131,7 +131,7 @@ def _check_series(motor: Context, series: dict[str, Series]) -> None:
             if step > MAX_COUNT_STEP and not motor.plan.own:
                 raise BagError(
                     f"{motor.where}: the count moves by {step:.2g} between samples, more than an "
-                    "encoder counts; map the column of its counts"
+                    "encoder can; map the column of its counts"
                 )
         bad = checks.find_impossible_values(
             value, steps_allowed=name in ("voltage", "supply", "current")
@@ -213,7 +213,7 @@ def _times_across_resets(
     """Return times for a recording during which the clock of the stamps was set back."""
     if len(tables) > 1:
         motor.findings.pop()
-        text = "time: log times (the clock of the header stamps was set back meanwhile)"
+        text = "time: log times (the clock of the header stamps was set back while recording)"
         motor.report("time_base", text)
         return {topic: table.logged for topic, table in tables.items()}
     topic, table = next(iter(tables.items()))
@@ -224,7 +224,9 @@ def _times_across_resets(
     pauses = [max(int(log[begin] - log[begin - 1]), least) for begin, _ in parts[1:]]
     time = clock.concatenate_parts([stamp], [parts], pauses)[0]
     text = f"{topic}: the clock of the header stamps was set back {len(pauses)} times"
-    motor.report("clock_set_back", f"{text}; a new segment each", "warning", times=len(pauses))
+    motor.report(
+        "clock_set_back", f"{text}; each begins a new segment", "warning", times=len(pauses)
+    )
     return {topic: time}
 
 

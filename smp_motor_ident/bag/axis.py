@@ -25,14 +25,14 @@ from smp_motor_ident.errors import BagError
 from smp_motor_ident.finding import Finding, Severity
 from smp_motor_ident.record import Hardware, Record
 
-MIN_SHIFT_ROWS = 2  # smallest shift to correct; one row is a voltage that acts before its row
+MIN_SHIFT_ROWS = 2  # smallest corrected shift; one row may be a voltage held before its row
 MAX_TESTED_ROWS = 20_000  # rows examined for such a shift
 MAX_BRIDGED_SAMPLES = 2  # samples that may be lost in a row before a new segment begins
 
 
 @dataclass(eq=False)
 class Context:
-    """Mapping, hardware and findings of one motor while its record is made."""
+    """Mapping, hardware, tables and findings while the record of one motor is made."""
 
     wheel: str
     plan: MotorMap
@@ -47,7 +47,7 @@ class Context:
         return f"{self.source}: {self.wheel}"
 
     def report(self, code: str, text: str, severity: Severity = "note", **evidence: float) -> None:
-        """Add a finding unless it is there already."""
+        """Add a finding, once."""
         finding = make_finding(code, text, severity, **evidence)
         if finding not in self.findings:
             self.findings.append(finding)
@@ -141,8 +141,8 @@ def _undo_delay(
         return axis, columns, starts
     late = rows * measure_sampling(axis[part]).interval * 1e-9
     text = (
-        f"the voltage is recorded {1e3 * late:.3g} ms ({rows} rows) after it acts: the motion is "
-        "ahead of it, or was smoothed both ways; it was moved back"
+        f"the voltage is recorded {1e3 * late:.3g} ms ({rows} rows) after it acts, or the motion "
+        "was smoothed in both directions; the voltage was moved back"
     )
     motor.report("voltage_late", text, "warning", rows=rows, late=late)
     keep = np.concatenate([np.arange(a, b) < b - rows for a, b in pairwise(edges)])

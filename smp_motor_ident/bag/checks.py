@@ -51,7 +51,7 @@ def find_impossible_values(value: Array, *, steps_allowed: bool) -> Flags:
 
 
 def has_two_publishers(count: Array) -> bool:
-    """Return whether a count jumps to and fro between two courses from sample to sample."""
+    """Return whether samples alternate between two counters."""
     there = np.abs(np.diff(count))[:-1]
     back = np.abs(count[2:] - count[:-2])
     returns = (there > MIN_COUNTS_BETWEEN_PUBLISHERS) & (back < 0.1 * there)
@@ -60,7 +60,7 @@ def has_two_publishers(count: Array) -> bool:
 
 
 def is_unsigned(voltage: Series, current: Series) -> bool:
-    """Return whether a current is positive in both directions: of the supply, or without sign.
+    """Return whether a current is positive in both directions: the supply's, or one without sign.
 
     The armature's current follows the sign of the voltage: its means at positive and at negative
     voltage cancel except for an offset.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Clocks, order and gaps of samples, and means of held inputs over intervals."""
+"""Determine clocks, order and gaps of samples; average held inputs over intervals."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -58,9 +58,9 @@ def nanoseconds(column: NDArray[Any], signal: Signal, unit: str) -> Integers:
 
 @dataclass(frozen=True)
 class ClockFit:
-    """Recorder's time against stamps: ``log = stamp + offset + drift (stamp - origin)``."""
+    """Conversion from stamps to log times: ``log = stamp + offset + drift (stamp - origin)``."""
 
-    offset: float  # [ns] at ``origin``, without the latency that the fastest messages had too
+    offset: float  # [ns] at ``origin``, including the latency of the fastest messages
     drift: float  # seconds per second
     origin: int  # stamp [ns]
 
@@ -95,7 +95,7 @@ def fit_clock(stamp: Integers, log: Integers) -> ClockFit:
 
 
 def judge_stamps(stamp: Integers | None, log: Integers) -> str:
-    """Return the reason against header stamps as the samples' times, empty if usable."""
+    """Return why header stamps are not the times of the samples; empty if they are usable."""
     if stamp is None:
         return "the messages carry no stamp"
     if stamp.size < 2:
@@ -112,8 +112,8 @@ def judge_stamps(stamp: Integers | None, log: Integers) -> str:
 def split_at_resets(time: Integers) -> Parts:
     """Split samples, in the order of logging, where their clock was set back.
 
-    Single samples out of order are no reason to split, nor are shuffled ones: only long runs,
-    each in order by itself, are parts of their own.
+    Only long runs, each in order, are parts; single samples out of order and shuffled samples do
+    not split a recording.
     """
     whole = [(0, time.size)]
     if time.size < 40:
@@ -223,7 +223,7 @@ def _split_at_restarts(time: NDArray[Any], columns: Mapping[str, NDArray[Any]]) 
     back = np.flatnonzero(np.diff(time) < -MIN_RESTART_ROWS * np.median(moved)) + 1
     if back.size * 2 * _MIN_RUN_ROWS > time.size:  # shuffled, not restarted
         return [(0, time.size)]
-    # Not a single row that came early or late: most rows that follow are earlier than those before
+    # After a restart, unlike after one early or late row, most rows are earlier than those before
     falls = [
         k
         for k in back.tolist()
@@ -245,7 +245,7 @@ def _overlaps(
     earlier, later = np.sort(time[old]), time[new]
     inside = later[(later >= earlier[0]) & (later <= earlier[-1])]
     holes = np.unique(np.searchsorted(earlier, inside, "right"))
-    # A block that came late fills one hole, a few late rows one each; a last run may be short.
+    # A late block fills one hole, each late row another one; the last run may be short.
     least = (
         _MIN_RUN_ROWS
         if later.size > 2 * _MIN_RUN_ROWS
@@ -318,8 +318,10 @@ def concatenate_runs(tables: Mapping[str, Table], gap: float, where: str) -> dic
     pause = max(pause_between(t, parts, gap) for t, parts in zip(times, every.values()))
     count = next(iter(numbers.values()))
     moved = concatenate_parts(times, list(every.values()), [pause] * count)
-    text = f"{where}: the time starts again {count} times, as of runs written one below another"
-    warning = make_finding("clock_set_back", f"{text}; a new segment each", "warning", times=count)
+    text = f"{where}: the time starts again {count} times, as if runs were appended"
+    warning = make_finding(
+        "clock_set_back", f"{text}; each begins a new segment", "warning", times=count
+    )
     return {
         topic: replace(table, log=time, findings=[*table.findings, warning])
         for (topic, table), time in zip(tables.items(), moved)

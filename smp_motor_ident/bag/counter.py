@@ -153,7 +153,7 @@ def unwrap(count: Integers, bits: int | None, expected: Array | None = None) -> 
 
 def report_resets(what: str, times: int) -> Finding:
     """Report resets of a counter or an angle."""
-    text = f"the {what} was reset {times} times; a new segment each"
+    text = f"the {what} was reset {times} times; each reset begins a new segment"
     return make_finding("counter_reset", text, "warning", times=times)
 
 

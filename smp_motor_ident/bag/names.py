@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Guess a field's signal, wheel and unit from its name."""
+"""Guess signal, wheel and unit of a field from its name."""
 
 import re
 from collections.abc import Sequence
@@ -28,7 +28,7 @@ ROLE_PATTERNS = {
 MOTIONS = ("velocity", "position", "count")
 NOT_VOLTAGE = r"twist|cmd_vel|linear|angular|batter|supply|vbat"
 TORQUE_NAMES = r"effort"
-"""A torque [N m] in ``sensor_msgs/JointState``; some drivers put their command there."""
+"""Torque [N m] of ``sensor_msgs/JointState``; some drivers store their command in it."""
 POSE_NAMES = (
     r"pose(?:$|\W|_|[A-Z])|orientation|quaternion|(?:^|\W|_)(?:linear|angular)(?:$|\W|_)|translation"
     r"|transform|accel|gyro|magnet|(?:^|\W|_)(?:odom|gps|imu|point)(?:$|\W|_)"
@@ -56,7 +56,7 @@ _SIDES = (
     *("izq", "esquerda", "direita", "esquerdo", "direito", "sinistra", "destra"),
 )
 _LETTER = re.compile(r"(.*?)[\W_]*([abclrABCLR]|\d)(?:[\W_]*[\[(].*)?")
-"""A name that ends in the letter or digit of a motor, before an optional unit."""
+"""Name that ends with the letter or digit of a motor, before an optional unit."""
 _LETTERS = {"l": "left", "r": "right"}
 
 
@@ -111,7 +111,7 @@ def is_speed_command(name: str) -> bool:
 
 
 def names_voltage(text: str) -> bool:
-    """Return whether a name denotes a voltage or duty cycle rather than any command."""
+    """Return whether a name denotes a voltage or duty cycle, not just a command."""
     return re.search(VOLTAGE_NAMES, text, re.IGNORECASE) is not None
 
 

@@ -126,7 +126,7 @@ def _by_names_and_data(recording: Recording, topics: list[TopicInfo], types: Typ
     chosen, remarks = _select_by_names(every)
     if alone and not chosen and (pair := _select_by_data([c for c in every if c is not time])):
         chosen = [("", pair)]
-        remarks = [f"by the data alone: {pair[1].source} follows {pair[0].source}; see to both"]
+        remarks = [f"by the data alone: {pair[1].source} follows {pair[0].source}; check both"]
     if not chosen:
         without = [c.source for c in fields if not c.value.size and c.role in _ROLES][:4]
         remarks += [f"{one} holds no number" for one in without]
@@ -144,7 +144,7 @@ def _by_names_and_data(recording: Recording, topics: list[TopicInfo], types: Typ
 def _select_by_names(
     every: Sequence[_Candidate],
 ) -> tuple[list[tuple[str, list[_Candidate]]], list[str]]:
-    """Return voltages and motions by wheel according to their names, and unconfirmed ones."""
+    """Return voltage and motions of each wheel by their names, and remarks on doubtful ones."""
     wheels: dict[tuple[str, str], list[_Candidate]] = {}
     for candidate in _assign_motors(_assign_robots(every)):
         wheels.setdefault((candidate.robot, candidate.wheel), []).append(candidate)
@@ -297,7 +297,7 @@ def _read_own_mapping(recording: Recording) -> Proposal | None:
 
 
 def _select_untestable(voltages: list[_Candidate], motions: list[_Candidate]) -> list[_Candidate]:
-    """Return a voltage that changes less often than a test needs, and a motion, by their names."""
+    """Return a voltage that changes too seldom for a test, and a motion, by their names."""
     seldom = [c for c in voltages if np.count_nonzero(np.diff(c.value)) < drives.COMMAND_LAGS]
     moving = [
         c for role in names.MOTIONS for c in motions if c.role == role and np.ptp(c.value) > 0
@@ -309,8 +309,8 @@ def _remark_on_unconfirmed(voltage: _Candidate) -> str:
     """Return the remark on a voltage that the data cannot confirm."""
     times = np.count_nonzero(np.diff(voltage.value))
     how = f"changes {times} time{'s' * (times > 1)} only" if times else "is constant"
-    untold = "so the data cannot confirm that it drives the motor"
-    return f"{voltage.source} {how}, {untold}; it was chosen by its name alone"
+    unconfirmed = "so the data cannot confirm that it drives the motor"
+    return f"{voltage.source} {how}, {unconfirmed}; it was chosen by its name alone"
 
 
 def _explain_failure(fields: list[_Candidate]) -> str:

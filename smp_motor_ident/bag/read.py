@@ -33,7 +33,7 @@ from smp_motor_ident.record import Hardware, Record
 STATE, DESCRIPTION = "smp_interfaces/msg/MotorState", "smp_interfaces/msg/MotorDescription"
 OWN_FIELDS = {name: name for name in ("voltage", "current", "velocity", "position")}
 OWN_FIELDS["count"] = "encoder_count"
-PAUSE_BETWEEN_RECORDINGS_S = 1.0  # time [s] that a joined record leaves between two recordings
+PAUSE_BETWEEN_RECORDINGS_S = 1.0  # pause [s] between two joined recordings
 
 
 def read_experiments(paths: Any, mapping: Any = None) -> dict[str, list[Record]]:
@@ -162,7 +162,7 @@ _DAMAGE = (
     ArithmeticError, AttributeError, LookupError, MemoryError, OSError, RecursionError,
     TypeError, ValueError, struct.error,
 )  # fmt: skip
-"""Errors that damaged bytes cause in readers; the message names the file, not the code."""
+"""Errors of readers on damaged bytes, reported with the file instead of the code."""
 
 
 def _assemble_records(recording: Recording, asked: SignalMap, types: Types) -> list[Record]:

@@ -29,7 +29,7 @@ class Replay:
             raise BagError(f"{path}: is a table, not a bag")
         channels = self._recording.channels()
         self.channels = list({(c.topic, c.type): c for c in channels}.values())
-        self.findings = self._recording.findings  # on missing or damaged parts
+        self.findings = self._recording.findings  # missing or damaged parts
 
     def messages(
         self, wanted: Callable[[Channel], bool] = lambda _: True

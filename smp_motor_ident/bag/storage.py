@@ -20,7 +20,7 @@ TABLE = "table"  # encoding of a channel whose file holds columns of numbers ins
 def make_finding(
     code: str, message: str, severity: Severity = "note", **evidence: float
 ) -> Finding:
-    """Return a finding made while reading."""
+    """Return a finding with its evidence."""
     return Finding(code, severity, message, evidence)
 
 
@@ -87,8 +87,7 @@ class Batch:
 class Table:
     """Samples of one topic, or rows of a file, in the order of the file."""
 
-    # shape (n,), [ns]: when the recorder got them; None where the file has no time but in its
-    # columns. Where ``clocked``, the file's own column of time.
+    # shape (n,), [ns]: times of arrival, or of the file if ``clocked``; None if they are a column
     log: Integers | None
     stamp: Integers | None  # shape (n,), [ns]: what their header says
     columns: dict[str, NDArray[Any]]  # shape (n,): by field path, in the type of the message

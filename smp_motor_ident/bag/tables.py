@@ -43,7 +43,7 @@ def is_time_of_part(path: str) -> bool:
 
 
 def resolve_signals(plan: MotorMap, channels: list[Channel]) -> MotorMap:
-    """Return a plan whose signals name topics and fields as the files do."""
+    """Return a plan with the topics and fields of its signals as the files call them."""
     signals = dict(plan.signals)
     for name, signal in plan.signals.items():
         for topic in (c.topic for c in channels if not signal.topic and c.topic.startswith("/")):
@@ -56,7 +56,7 @@ def resolve_signals(plan: MotorMap, channels: list[Channel]) -> MotorMap:
 
 
 def _resolve_signal(name: str, signal: Signal, tables: list[Channel]) -> Signal:
-    """Find a signal's column: of a topic, of the only table, or an entry that is one signal."""
+    """Find the column of a signal: in a topic, in the only table, or as an entry of its own."""
     whole = f"{signal.topic}.{signal.field}" if signal.topic else signal.field
     entry = re.fullmatch(r"(.+?)((?:\[\d+\])?)", whole)
     choices = [(signal.topic, signal.field), ("", whole)]
@@ -254,7 +254,7 @@ def _check_seconds(log: Integers, signal: Signal, recording: Recording) -> None:
 
 
 def _read_nanoseconds(table: Table, signal: Signal) -> tuple[Integers, str]:
-    """Return the times of a table, `NEVER` for missing cells, and an inferred unit."""
+    """Return the times of a table, `MISSING_TIME` for missing cells, and an inferred unit."""
     column = table.columns[signal.field]
     if signal.field in table.exact:
         return column.astype(np.int64), ""

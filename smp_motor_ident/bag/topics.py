@@ -39,7 +39,7 @@ class Proposal:
 
     suggestion: list[str] = field(default_factory=list)  # items for ``--map``
     asked: list[str] = field(default_factory=list)  # items that the user must add
-    remark: str = ""  # why there are no items, or which of them the data do not confirm
+    remark: str = ""  # reason for no items, or items that the data do not confirm
 
 
 @dataclass(kw_only=True)

@@ -21,8 +21,7 @@ COMMAND = "smp_interfaces/msg/MotorCommand"
 
 MIN_COMMANDS = 50  # smallest number of commands for quantiles of the delay
 DELAY_QUANTILE = 0.95
-"""Share of the commands covered by the longest delay: margins concern lasting delays, a single late
-command is a disturbance."""
+"""Share of the commands that the longest delay covers: a single late command is a disturbance."""
 
 MAX_RESIDUAL_SHARE = 0.3
 """A delay explains the applied voltage if the residual is below this share of its steps."""
@@ -33,9 +32,9 @@ class TransportDelay:
     """Delay from the stamp of a sample to the arrival of its command."""
 
     usual: float  # median [s]
-    longest: float  # that 95 % of the commands keep [s]
+    longest: float  # 95 % quantile [s]
     latched: bool  # whether the driver keeps a command until its next sample
-    answers: int  # commands that this was measured from
+    answers: int  # number of measured commands
 
     def until_applied(self, sample_time: float) -> tuple[float, float]:
         """Return usual and longest delay until the voltage is applied."""

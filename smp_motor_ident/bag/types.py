@@ -20,7 +20,7 @@ Fields = Sequence[tuple[str, Any]]
 Definitions = Mapping[str, Fields]
 """Fields of every message type by its full name; the field's description is rosbags'."""
 Lookup = Callable[[str], Fields | None]
-"""From a type's full name to its fields, None where they are not known there."""
+"""Function from the full name of a type to its fields; None if unknown."""
 
 _STORES = (Stores.ROS2_JAZZY, Stores.ROS2_HUMBLE, Stores.ROS2_FOXY, Stores.ROS2_DASHING)
 _DAMAGE = (TypesysError, BagError, ValueError, LookupError, TypeError, RecursionError)

@@ -47,7 +47,7 @@ _ROWS: tuple[tuple[str, Mapping[str, int], dict[str, float]], ...] = (
     ("direction", {}, {"": 1.0}),
 )
 UNITS: dict[str, dict[str, Unit]] = {signal: {} for signal, _, _ in _ROWS}
-"""By signal; the first unit of each is assumed where none is given."""
+"""Units by signal; the first one is the default."""
 for _signal, _needs, _factors in _ROWS:
     UNITS[_signal] |= {unit: Unit(value, _needs) for unit, value in _factors.items()}
 
@@ -100,7 +100,7 @@ def check_unit(signal: str, unit: str) -> str:
 
 
 def needs(signal: str, unit: str, name: str) -> bool:
-    """Return whether a signal in this unit needs, say, the ``wheel_radius`` or supply_voltage."""
+    """Return whether a unit of a signal needs a property such as ``wheel_radius``."""
     one = UNITS.get(signal, {}).get(unit)
     return one is not None and name in one.needs
 

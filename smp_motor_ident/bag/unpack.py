@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Decompress with a limit on memory.
 
-A few bytes of zstd, lz4 or bz2 may expand to gigabytes.  Everything is unpacked in small pieces,
-and all pieces of a recording together may not exceed a multiple of its size; the
-environment variable ``SMP_BAG_UNPACKED`` (bytes, or such as ``8G``) raises that limit.
+A few bytes of zstd, lz4 or bz2 may expand to gigabytes.  The unpacked size of a recording is
+limited to a multiple of its packed size; the environment variable ``SMP_BAG_UNPACKED`` (bytes, or
+a size such as ``8G``) raises the limit.
 """
 
 import bz2
@@ -72,7 +72,9 @@ def _read_user_limit() -> int:
     try:
         return int(float(text.rstrip("KMG")) * factor)
     except (ValueError, OverflowError):
-        raise BagError(f"{VARIABLE} is {text!r}; give bytes, or such as 512M or 8G") from None
+        raise BagError(
+            f"{VARIABLE} is {text!r}; give bytes, or a size such as 512M or 8G"
+        ) from None
 
 
 def decompress_stream(blocks: Iterable[bytes], kind: str) -> Iterator[bytes]:

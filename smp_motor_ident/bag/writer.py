@@ -23,7 +23,7 @@ from smp_motor_ident.errors import BagError
 
 FLUSH_PERIOD = 0.5
 MAX_FLUSH_SHARE = 0.05
-"""Largest share of the time for flushing; longer files are flushed less often."""
+"""Largest share of the time for flushing; long files are flushed less often."""
 
 _FOREVER = {"sec": 9223372036, "nsec": 854775807}
 DEFAULT_QOS: dict[str, Any] = {
@@ -62,7 +62,7 @@ class _Topic:
 
 
 class _Draft:
-    """Buffer for the end of the file until a flush."""
+    """Buffer of the end of the file, until a flush."""
 
     def __init__(self) -> None:
         self.begin = 0

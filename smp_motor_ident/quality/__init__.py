@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Faults of recordings: found, and put right where the recording shows how."""
+"""Detect faults of recordings, and repair those whose cause the recording shows."""

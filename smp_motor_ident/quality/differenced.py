@@ -7,9 +7,8 @@ they would be far overestimated, and a loop that responds to them would bias the
 over m samples sum up to m counts in a row with m times the error; a fitted motor whose residual is
 one count's rounding identifies m.
 
-A difference over the time that it took is the speed, over the nominal period of a loop that is late
-it is as much too large as that interval is too long: neighbouring speeds then differ as their
-intervals do, which those of a motor do not.
+A count divided by the nominal period of a loop instead of the actual interval is wrong in
+proportion to that interval: neighbouring speeds then differ as their intervals do.
 
 References
 ----------
@@ -35,11 +34,11 @@ from smp_motor_ident.limits import (
 from smp_motor_ident.quality.resolution import speed_quantum
 from smp_motor_ident.record import Record
 
-SMOOTHING_SAMPLES = 9  # of a moving mean that keeps the motion and removes the rounding
-CUBIC_SAMPLES = 15  # over which a motion is a cubic
-MAX_STEPPED_COUNTS = 100  # per interval, at which the speed shows its steps
-MIN_GAP_RATIO = 2.0  # of a gap to the usual interval
-MAX_INTERVAL_ERROR = 0.5  # of the usual interval; a larger one may hide a lost sample
+SMOOTHING_SAMPLES = 9  # length of a moving mean that removes the rounding
+CUBIC_SAMPLES = 15  # samples over which a motion is a cubic
+MAX_STEPPED_COUNTS = 100  # largest counts per interval at which a speed shows its steps
+MIN_GAP_RATIO = 2.0  # ratio of a gap to the usual interval
+MAX_INTERVAL_ERROR = 0.5  # share of the usual interval; a larger one may hide a lost sample
 
 
 def recover_counts(group: Sequence[Record]) -> list[Record]:
@@ -89,7 +88,7 @@ def read_count_rounding(record: Record) -> float:
 
 
 def _is_smooth_within_one_count(moved: Array) -> bool:
-    """Tell whether changing counts differ from a local cubic by the rounding of one count.
+    """Return whether changing counts differ from a local cubic by the rounding of one count.
 
     With more than a few counts per sample the speed itself can be used.
     """
@@ -107,7 +106,7 @@ def _is_smooth_within_one_count(moved: Array) -> bool:
 
 
 def _has_alternating_errors(moved: Array) -> bool:
-    """Tell whether neighbours have errors of opposite sign, after removing the motion."""
+    """Return whether neighbours have errors of opposite sign, after removing the motion."""
     smooth = np.convolve(moved, np.full(SMOOTHING_SAMPLES, 1 / SMOOTHING_SAMPLES), "same")
     rest = (moved - smooth)[SMOOTHING_SAMPLES:-SMOOTHING_SAMPLES]
     size = float(rest @ rest)
@@ -153,7 +152,7 @@ def _find_nominal_period(velocity: Array, per_turn: float | None, usual: float) 
 
 
 def _follows_intervals(velocity: Array, interval: Array) -> bool:
-    """Tell whether deviations of speeds from their neighbours' mean follow their intervals.
+    """Return whether deviations of speeds from their neighbours' mean follow their intervals.
 
     The slope is one for counts over a nominal period, and zero for a motor's speed.
     """

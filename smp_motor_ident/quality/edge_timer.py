@@ -24,12 +24,12 @@ from smp_motor_ident.limits import (
 from smp_motor_ident.quality.resolution import speed_quantum
 from smp_motor_ident.record import Record
 
-MIN_HOLDING_ROWS = 2.05  # that identify a count
+MIN_HOLDING_ROWS = 2.05  # shortest holding time that identifies a count
 HOLDING_TOLERANCE_ROWS = 1.05
 COUNT_PERCENTILES = np.arange(1.0, 100.0)  # percentiles tried as the size of a count
-TIMER_TICK_S, TICK_TOLERANCE = 1e-6, 0.05  # tolerance in ticks
-MAX_NEIGHBOUR_ROWS = 2.5  # between interpolated readings: one row may be missing
-MIN_COUNT_ROWS = 0.25  # of a count; a faster motor does not stop between two rows
+TIMER_TICK_S, TICK_TOLERANCE = 1e-6, 0.05  # resolution of a timer, and tolerance in ticks
+MAX_NEIGHBOUR_ROWS = 2.5  # distance of interpolated readings: one row may be missing
+MIN_COUNT_ROWS = 0.25  # duration of a count; a faster motor does not stop between two rows
 
 
 def interpolate_edge_timing(record: Record) -> Record:
@@ -47,8 +47,8 @@ def interpolate_edge_timing(record: Record) -> Record:
     found = Finding(
         "edge_timer",
         "warning",
-        f"the speed is from the time of one count ({count:.3g} rad), held until the next: it lags "
-        f"at low speed; {100 * share:.0f} % of the readings were left out",
+        f"the speed is measured by the time of one count ({count:.3g} rad) and held to the next, "
+        f"so it lags at low speed; {100 * share:.0f} % of the readings were left out",
         {"count": count, "share": share},
         "record the encoder's counts",
     )
@@ -88,7 +88,7 @@ def _find_count_angle(record: Record, velocity: Array) -> float:
 
 
 def _are_timer_ticks(period: Array) -> bool:
-    """Tell whether times of a count are whole microseconds, as of usual timers."""
+    """Return whether times of a count are whole microseconds, as of usual timers."""
     rest = period / TIMER_TICK_S - np.rint(period / TIMER_TICK_S)
     return bool(np.mean(np.abs(rest) < TICK_TOLERANCE) > MIN_HELD_SHARE)
 
@@ -104,14 +104,14 @@ def _interpolate_speed(record: Record, velocity: Array, count: float) -> tuple[A
         rows = slice(begin, end)
         when, reading, time = record.time[rows], speed[rows], took[rows]
         before = np.append(np.nan, reading[:-1])
-        # After a rest, or back over the same edge, that time is not one of a count.
+        # After a rest, or on the way back over the same edge, this time is not that of a count.
         fresh = (reading * before > 0) & ((reading != before) | (time < MIN_COUNT_ROWS * step))
         # The last edge was up to a row ago, or up to a count where that takes less.
         middle = when - 0.5 * (time + np.minimum(time, step))
         at, max_gap = np.flatnonzero(fresh), MAX_NEIGHBOUR_ROWS * step
         out[rows] = _interpolate_rows(when, middle[at], reading[at], max_gap)
         close = _find_adjacent(middle[at], reading[at], max_gap)
-        # Before a reversal or a rest the last edge may be longer ago than by that.
+        # Before a reversal or a rest the last edge may be older.
         own = at[1:-1][close[:-1] & close[1:] & (time[at[1:-1]] <= step)]
         out[rows][own] = _extrapolate_readings(when, middle, reading, own, at)
         zero = (reading == 0) & np.isfinite(velocity[rows])

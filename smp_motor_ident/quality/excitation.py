@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Select the informative parts of recordings: the excitation, and stretches of long ones."""
+"""Select the excited part of a recording, and evenly spread stretches of a long one."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -12,11 +12,11 @@ from smp_motor_ident.limits import MAX_EXCERPT_ROWS, MAX_REST_VOLTAGE, MIN_SAMPL
 from smp_motor_ident.record import Record
 
 STRETCH_COUNT = 8
-"""Number of stretches of a long record: they show changes, and each is long against the lag."""
+"""Number of stretches of a long record: enough to show changes, each longer than the lag."""
 
 MIN_REST_ROWS = 2_000
-REST_MARGIN = 10  # on either side
-MAX_NOISE_STDS = 6.0  # of the sensor, that do not count as motion
+REST_MARGIN = 10  # rows of rest kept on either side
+MAX_NOISE_STDS = 6.0  # standard deviations of sensor noise that do not count as motion
 
 
 def _estimate_white_std(values: Array) -> float:
@@ -63,14 +63,14 @@ def select_excerpts(
 
 
 def _cut_stretches(record: Record, count: int, length: int) -> list[Record]:
-    """Return stretches of so many rows each, with a finding that tells of them."""
+    """Return stretches of equal length, with a finding."""
     found = Finding(
         "excerpt",
         "note",
-        f"the record has {len(record)} rows; {count} stretches of {length} rows were used, since "
-        "more rows take longer and hardly narrow the estimates",
+        f"the record has {len(record)} rows; {count} stretches of {length} rows were used, because "
+        "more rows cost time and hardly narrow the estimates",
         {"rows": float(len(record)), "used": float(count * length)},
-        "cut the recording to have a certain part of it used",
+        "to use a certain part, cut the recording",
     )
     record = replace(record, findings=(*record.findings, found))
     begins = np.linspace(0, len(record) - length, count).astype(np.int64).tolist()

@@ -16,10 +16,10 @@ from smp_motor_ident.finding import Finding
 from smp_motor_ident.limits import MAX_GLITCH_SHARE, MIN_GLITCH_RATIO
 from smp_motor_ident.record import Record
 
-MIN_GLITCH_SHARE = 0.05  # of the signal's range, and of the voltage's for a pulse
-MIN_CHANGE_RATIO = 4.0  # of a glitch to the usual change; counters dither by one or two
-MAX_SAMPLED_READINGS = 4_000  # for the usual change
-MAX_PASSES = 4  # each finds one of several in a row
+MIN_GLITCH_SHARE = 0.05  # share of the signal's range, and of the voltage's for a pulse
+MIN_CHANGE_RATIO = 4.0  # ratio of a glitch to the usual change; counters dither by one or two
+MAX_SAMPLED_READINGS = 4_000  # readings that determine the usual change
+MAX_PASSES = 4  # a pass finds one of several adjacent glitches
 
 
 def remove_glitches(record: Record) -> Record:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A signal through a lag of the first order, sample by sample."""
+"""Filter a signal by a first-order lag."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ MIN_DECAYED_VALUE = 1e-100  # its square is still a normal number
 
 
 def apply_lag(values: Array, samples: float) -> Array:
-    """Filter a signal by a lag of ``samples``, from rest; leave it unchanged for a lag of 0.
+    """Filter a signal by a first-order lag of ``samples``, from rest; a lag of 0 changes nothing.
 
     Tails are set to zero before they become subnormal numbers, which slow
     ``scipy.signal.lfilter`` tenfold.

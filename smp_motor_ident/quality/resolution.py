@@ -10,10 +10,10 @@ import numpy as np
 from smp_motor_control.arrays import Array, Flags, Integers
 from smp_motor_ident.record import Record
 
-MIN_REST_SAMPLES = 10  # of an unchanged count at standstill
+MIN_REST_SAMPLES = 10  # samples of an unchanged count that are a standstill
 MIN_ENCODER_STEP = 2 * np.pi / 2**17
-"""Resolution [rad] of the encoders of servos, finer than those of any wheel."""
-MIN_SENSOR_STEP_SHARE = 1e-4  # of its range: the best linearity of amplifiers, tachometers
+"""Resolution [rad] of servo encoders, finer than that of any wheel."""
+MIN_SENSOR_STEP_SHARE = 1e-4  # share of the range: best linearity of amplifiers and tachometers
 MAX_SAMPLED_READINGS = 2_000  # to decide whether a speed repeats its values
 MIN_LEVELS = 30
 """Levels whose mean distance from multiples of a step shows it: five deviations from chance."""
@@ -65,7 +65,7 @@ def angle_quantum(angle: Array) -> float:
     moves = moves[:: -(-moves.size // MAX_SAMPLED_READINGS)]
     for parts in (1, 2, 3):  # a motor that is fast in every sample may show no single step
         quantum = float(moves[0]) / parts
-        for reach in (4.0, 20.0, 100.0, np.inf):  # the longer moves tell it better
+        for reach in (4.0, 20.0, 100.0, np.inf):  # longer moves determine it more accurately
             near = moves[moves < reach * quantum]
             whole = np.round(near / quantum)
             quantum = float(near @ whole / (whole @ whole))

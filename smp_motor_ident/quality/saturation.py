@@ -12,7 +12,7 @@ from smp_motor_ident.finding import Finding
 from smp_motor_ident.limits import MIN_REGULATED_VARIANCE
 from smp_motor_ident.record import Record
 
-SMOOTHING_SAMPLES = 9  # of a moving mean that keeps the motion of a speed from counts
+SMOOTHING_SAMPLES = 9  # length of a moving mean that keeps the motion of a counted speed
 
 
 def refuse_saturation(record: Record, speed: Array, where: str) -> Iterator[Finding]:
@@ -32,7 +32,7 @@ def refuse_saturation(record: Record, speed: Array, where: str) -> Iterator[Find
             continue
         for limit in (x.max(), x.min()):
             at = x == limit
-            if abs(limit) < 0.5 * np.abs(x).max():  # the slowest that it turned, one way
+            if abs(limit) < 0.5 * np.abs(x).max():  # the extreme of the slower direction
                 continue
             share = float(at.mean())
             next_times = times[-2] if limit == levels[-1] else times[1]
@@ -78,7 +78,7 @@ def _report_regulation(current: float) -> Finding:
 
 
 def _fits_constant_current(rests: Flags, voltage: Array, speed: Array) -> bool:
-    """Tell whether the voltage fits the speed at a constant current, ``v = R i + K w``.
+    """Return whether the voltage fits the speed at a constant current, ``v = R i + K w``.
 
     Behind a clipped sensor the current varies, and the voltage does not fit.
     """
@@ -91,7 +91,7 @@ def _fits_constant_current(rests: Flags, voltage: Array, speed: Array) -> bool:
 
 
 def _has_one_level(v: Array) -> bool:
-    """Tell whether the motor is driven by one level of voltage, at which it may come to rest."""
+    """Return whether the voltage has one level, at which a motor may settle."""
     driven = v[np.abs(v) > limits.MAX_REST_VOLTAGE * np.abs(v).max()]
     return not driven.size or bool(
         np.ptp(driven) < 10 * limits.VOLTMETER_SCATTER * np.abs(driven).max()
@@ -99,7 +99,7 @@ def _has_one_level(v: Array) -> bool:
 
 
 def _jumps_to_limit(x: Array, at: Flags) -> bool:
-    """Tell a clipped signal from one that settles: it jumps to its limit, scatters elsewhere."""
+    """Return whether a signal jumps to its limit and scatters elsewhere: clipped, not settled."""
     enters = np.flatnonzero(at[1:] & ~at[:-1]) + 1
     rest = x[(x != x.max()) & (x != x.min())]
     if not enters.size or np.unique(rest).size < 0.5 * rest.size:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Detect and name bad data before any estimation."""
+"""Detect bad data before the estimation."""
 
 from collections.abc import Iterator, Sequence
 
@@ -126,11 +126,11 @@ def _check_excitation(records: Sequence[Record], where: str) -> None:
         )
 
 
-MIN_MEANS = 12  # of a record, to know their scatter
+MIN_MEANS = 12  # means of a record that show their scatter
 
 
 def _rises_at_start(record: Record) -> bool:
-    """Tell whether a speed rises under a constant voltage: a step before the first row.
+    """Return whether a speed rises under a constant voltage: a step before the first row.
 
     Means over several lengths are compared, since the rise may take few samples or many; their
     noise is the scatter in the last third.

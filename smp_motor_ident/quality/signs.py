@@ -26,7 +26,7 @@ from smp_motor_ident.record import Record
 LAG_COUNT = 16  # from a sampling interval to a quarter of the record, each 1.5 to 2 times the last
 MAGNITUDE_LAG_COUNT = 8  # up to a tenth of the record
 SAMPLES_PER_LAG = 16
-MAX_RUNS = 2_000  # over which signals are averaged, to reduce a counter's noise
+MAX_RUNS = 2_000  # averaged runs of a record, which reduce the noise of a counter
 TRAVEL_RUNS = 50  # of a record
 
 
@@ -36,7 +36,7 @@ class SignCorrelation:
 
     right: float  # as it is
     wrong: float  # with the other sign
-    chance: float  # standard deviation of the latter for independent signals
+    chance: float  # standard deviation of ``wrong`` for independent signals
 
 
 def correlate_with_voltage(
@@ -80,7 +80,7 @@ def correlate_with_voltage(
 
 
 def _average_runs(record: Record, signal: Array) -> tuple[float, Array, Array] | None:
-    """Return sampling interval, voltage and signal, both as means over runs that it outlives."""
+    """Return interval, voltage and signal, averaged over runs that keep the voltage's power."""
     known = np.isfinite(signal)
     if known.sum() < 20:
         return None
@@ -150,7 +150,7 @@ def _sum_travel(record: Record, speed: Array) -> Array:
 
 
 def _is_magnitude(record: Record) -> bool:
-    """Tell whether a speed is the magnitude of the motor's response to its voltage."""
+    """Return whether a speed is the magnitude of the motor's response to its voltage."""
     speed, volts = record.velocity, record.voltage
     if speed is None or record.count is not None or record.position is not None:
         return False

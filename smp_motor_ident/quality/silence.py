@@ -21,7 +21,7 @@ from smp_motor_ident.quality.lag import apply_lag
 from smp_motor_ident.record import Record
 
 LAG_COUNT = 12  # between a sampling interval and a quarter of the record
-FRICTIONS = (0.0, 0.1, 0.2, 0.35, 0.5, 0.7)  # of the largest voltage: to what hardly turns
+FRICTIONS = (0.0, 0.1, 0.2, 0.35, 0.5, 0.7)  # tried friction, as a share of the largest voltage
 
 
 def refuse_silent_sensor(record: Record, where: str) -> None:
@@ -54,7 +54,7 @@ def remove_silences(record: Record) -> Record:
             f"the {name} is constant from {begin:.4g} s to {end:.4g} s while the voltage would "
             "move the motor; this interval was left out",
             {"signal": name, "begin": float(begin), "end": float(end)},
-            "look for an obstacle of the motor, or for a loose cable of the encoder",
+            "look for a blocked motor, or for a loose cable of the encoder",
         )
         record = replace(select_rows(record, rows), findings=(*record.findings, finding))
     return record
@@ -79,7 +79,7 @@ def _find_silences(record: Record) -> Iterator[tuple[str, int, int]]:
         values = getattr(record, name)
         if values is None or len(record) < 200:
             continue
-        # A speed may well be constant; only at zero does it say that nothing turns.
+        # A constant speed is no silence unless it is zero.
         moves = values != 0 if name == "velocity" else np.diff(values, prepend=np.nan) != 0
         moves[list(record.starts)] = True  # a rest does not extend into the next run
         edges = np.concatenate([[0], np.flatnonzero(moves), [len(record) - 1]])
@@ -109,7 +109,7 @@ def _predict_swing(record: Record, name: str, a: int, b: int) -> float:
     known[a : b + 1] = False
     known[list(record.starts)] = False
     if known.sum() < MIN_SAMPLES or not levels.size:
-        return float("inf")  # nothing says how the motor answers
+        return float("inf")  # the response of the motor is unknown
     expected, least = _predict_speed(record, speed, known), float(levels.min())
     if name == "velocity":
         # Differences of counts flicker, so that their mean resolves less than a step; a rounded

@@ -28,7 +28,7 @@ from smp_motor_ident.limits import (
 )
 from smp_motor_ident.record import Record
 
-_MIN_PAUSE_NS = 20_000_000  # between groups of arrivals
+_MIN_PAUSE_NS = 20_000_000  # shortest pause between groups of arrivals
 JACKKNIFE_BLOCKS = 8
 _MIN_BEAT_SAMPLES = 50
 
@@ -98,7 +98,7 @@ def _fit_beat(arrival: Integers) -> tuple[Array, float, float] | None:
         begin, period = _fit_line(number, since)
         latency = since - begin - period * number
         highest_floor = np.minimum.reduceat(latency, begins).max()
-        # What arrives late catches up: where the sender is regular the floor stays.
+        # Late messages catch up: the floor of a regular sender stays.
         if period > 0 and highest_floor <= BEAT_FLOOR * period * longest:
             return begin + period * number, period, _compute_period_std(number, since)
     return None
@@ -166,13 +166,13 @@ def _fit_line(number: Array, value: Array) -> tuple[float, float]:
 
 
 def _is_rounded(beat: Beat, arrival: Integers) -> bool:
-    """Tell whether arrivals are the beat rounded to the multiples that their stamps have."""
+    """Return whether arrivals are the beat rounded to the multiples that their stamps have."""
     multiple = int(np.gcd.reduce(np.diff(arrival)))
     return int(np.ptp(arrival - beat.time)) <= multiple
 
 
 def is_on_beat(beat: Beat, arrival: Integers, motion: Array) -> bool:
-    """Tell whether a motion was sampled on the beat rather than at its arrivals.
+    """Return whether a motion was sampled on the beat rather than at its arrivals.
 
     A sample whose two instants lie clearly apart on the motion is nearer to the line between its
     neighbours at the true one: a sign test over these samples decides.  Most samples arrive
@@ -199,7 +199,7 @@ def _measure_curvature(time: Integers, value: Array) -> Array:
 
 
 def move_to_beat(record: Record) -> Record:
-    """Move late stamps of a record to the sender's beat; leave others unchanged.
+    """Move late stamps of a record to the beat of its sender; return other records unchanged.
 
     Irregular stamps may be the true sampling instants: the motion decides, unless they differ by
     their rounding only.
@@ -264,8 +264,8 @@ def merge_bunches(record: Record) -> Record:
     finding = Finding(
         "stamps_equal",
         "warning",
-        f"{100 * share:.0f} % of the samples have the stamp of the sample before; of samples that "
-        "are stamped alike the last was used",
+        f"{100 * share:.0f} % of the samples have the stamp of the sample before; the last of each "
+        "group with one stamp was used",
         {"share": share, "samples": float(kept.size)},
         "stamp each sample where it is measured, with a clock finer than the sampling interval",
     )
@@ -278,14 +278,14 @@ def merge_bunches(record: Record) -> Record:
     )
 
 
-INTERVAL_TOLERANCE = 0.1  # of whole multiples of an interval
+INTERVAL_TOLERANCE = 0.1  # tolerance of whole multiples of an interval
 
 
 def interpolate_lost_voltage(record: Record) -> Record:
     """Interpolate the voltage linearly where rows were lost, and average it.
 
-    Over ``m`` intervals, the last held at the next row's voltage, the mean is
-    ``v1 + (v2 - v1) (m + 1) / (2 m)``.  Readers of bags have done so.
+    Over ``m`` intervals, the last one at the next row's voltage, the mean is
+    ``v1 + (v2 - v1) (m + 1) / (2 m)``.  Records of bags are interpolated already.
     """
     step = np.diff(record.time)
     if step.size < 2 or any(f.code == "samples_missing" for f in record.findings):

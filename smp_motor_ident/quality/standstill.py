@@ -14,9 +14,9 @@ import numpy as np
 
 from smp_motor_control.arrays import Array, Flags, Integers
 
-MAX_REST_SPEED = 0.02  # of the largest speed
-MAX_REST_ANGLE = 1e-3  # of the whole travel
-MIN_REST_RATIO = 3.0  # of a rest to a reversal
+MAX_REST_SPEED = 0.02  # share of the largest speed
+MAX_REST_ANGLE = 1e-3  # share of the whole travel
+MIN_REST_RATIO = 3.0  # ratio of a rest to a reversal
 MIN_REST_ROWS = 2
 QUIET_ROWS = 8  # rows without voltage and motion
 MIN_DRIVING_VOLTAGE_SHARE = 0.05  # of the largest voltage
@@ -25,7 +25,7 @@ MIN_DRIVING_VOLTAGE_SHARE = 0.05  # of the largest voltage
 def detect_rest_at_start(
     time: Array, output: Array, voltage: Array, starts: Integers, is_angle: bool, quantum: float
 ) -> Flags:
-    """Tell for each segment whether the motor is at rest at its beginning, shape (g,)."""
+    """Return for each segment whether the motor is at rest at its beginning, shape (g,)."""
     out = np.zeros(len(starts) - 1, dtype=np.bool_)
     on = MIN_DRIVING_VOLTAGE_SHARE * float(np.abs(voltage).max(initial=0.0))
     extent = np.nanmax(output) - np.nanmin(output) if is_angle else np.nanmax(np.abs(output))
@@ -44,7 +44,7 @@ def detect_rest_at_start(
 
 
 def _begins_at_rest(t: Array, y: Array, is_angle: bool, quantum: float) -> bool:
-    """Tell whether one segment begins with a standstill.
+    """Return whether one segment begins with a standstill.
 
     At a constant acceleration, the time from one speed to its treble, or from one angle to nine
     times it, is twice the time before.

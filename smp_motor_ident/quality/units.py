@@ -28,7 +28,7 @@ RATIOS = {
     360.0: "in degrees, the other in turns",
     1000.0: "in thousandths of the other's unit",
 }
-"""Possible units of a speed and an angle that differ by such a factor."""
+"""Units of a speed and an angle, by the factor between them."""
 RATIO_TOLERANCE = 0.01  # relative; gear ratios usually differ by more
 
 
@@ -115,5 +115,5 @@ def check_plausibility(
         message = f"no motor has {' and '.join(word for word, there in odd.items() if there)}"
         yield Finding("implausible_motor", "warning", message, numbers, advice)
     elif speed > MAX_USUAL_SPEED:
-        message = f"the motor has {words}; among brushed motors, only those of toys do"
+        message = f"the motor has {words}; only brushed motors of toys are as fast"
         yield Finding("fast_motor", "warning", message, numbers, advice)

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Results for people and for programs: JSON, YAML, and a page with charts."""
+"""Write results: JSON and YAML for programs, pages with charts for people."""

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The page of a commissioning: verdict, motors and gains, predicted and measured drive, checks."""
+"""Make the page of a commissioning: verdict, motors, gains, verification drive, checks."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 COLUMNS = (
     ("breakaway", "starts to turn at [V]"),
-    ("friction", "keeps turning at [V]"),
+    ("friction", "keeps turning down to [V]"),
     ("gain", "speed per volt [rad/s/V, motor]"),
     ("coast", "comes to rest within [s]"),
     ("applied", "reported over commanded voltage"),
@@ -53,7 +53,7 @@ class Row:
     systematic: tuple[str, ...] = ()  # uncertainty of each cell, or none at all
 
     def tell(self, k: int) -> str:
-        """Return one wheel's quantity in a line."""
+        """Return the quantity of wheel ``k`` in one line."""
         shares = self.systematic[k] if self.systematic else ""
         text = f"{self.name} {self.cells[k]} {self.unit}"
         return f"{text}, systematic {shares}" if shares else text
@@ -86,7 +86,7 @@ def results(
 
 
 def _list_motor_rows(estimates: Mapping[str, Estimate]) -> Iterator[Row]:
-    """Return every number that the records tell, with random and systematic uncertainty."""
+    """Yield every known quantity, with random and systematic uncertainty."""
     held = [{**one.combinations, **one.parameters} for one in estimates.values()]
     for name in dict.fromkeys(name for one in held for name in one):
         found = [one.get(name, Quantity(None)) for one in held]
@@ -100,7 +100,7 @@ def _list_motor_rows(estimates: Mapping[str, Estimate]) -> Iterator[Row]:
 def _list_drive_rows(
     entries: Sequence[Mapping[str, Any]], driven: Sequence[Sequence[Mapping[str, Any]]]
 ) -> Iterator[Row]:
-    """Return settling and overshoot: designed, and the largest that were measured."""
+    """Yield settling and overshoot: designed, and the largest measured ones."""
     for name, title, scale, unit in (
         ("settling", "Settles", 1e3, "ms"),
         ("overshoot", "Overshoots", 1.0, "%"),
@@ -113,9 +113,12 @@ def _list_drive_rows(
         yield Row(f"{title}, designed", unit, tuple(designed))
         if name == "settling":
             planned = (_format_figure(scale, e["settling"]["transition"]) for e in entries)
-            yield Row("Planned transition, included", unit, tuple(planned))
+            yield Row("Duration of the planned change", unit, tuple(planned))
         if all(driven):
-            for key, of in (("allowed", "allowed in the drive"), ("reading", "driven")):
+            for key, of in (
+                ("allowed", "allowed in the drive"),
+                ("reading", "measured in the drive"),
+            ):
                 most = ([one[key][name] for one in changes] for changes in driven)
                 cells = (_format_figure(scale, None if None in m else max(m)) for m in most)
                 yield Row(f"{title}, {of}", unit, tuple(cells))
@@ -126,7 +129,7 @@ def _format_figure(scale: float, value: float | None) -> str:
 
 
 def charts(changes: Sequence[Change]) -> list[Chart]:
-    """Return one chart for each wheel: its changes of set-point measured, predicted, with band."""
+    """Return one chart for each wheel: measured and predicted changes of set-point, with band."""
     made = []
     for wheel, group in groupby(changes, lambda one: one.wheel):
         mine = list(group)
@@ -185,7 +188,7 @@ def render(
 
 
 def _verdict(document: Mapping[str, Any]) -> tuple[str, str]:
-    """Return a class and two words: "passed" is said of gains that drove."""
+    """Return the CSS class and the words of the verdict."""
     if document["passed"] is None:
         return "fair", "Not finished."
     if not document["passed"]:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Wheels side by side: each quantity's intervals on one axis, as shares of its length."""
+"""Compare wheels side by side: the intervals of each quantity on one axis."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -15,7 +15,7 @@ COMPARED = (
 )  # fmt: skip
 """Quantities compared between wheels, where known."""
 
-MARGIN = 0.06  # of the axis, beyond the intervals
+MARGIN = 0.06  # share of the axis beyond the intervals
 
 
 @dataclass(frozen=True)

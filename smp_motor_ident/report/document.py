@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Estimates as files: ``identification.json`` and ``motors.yaml``, written all or none."""
+"""Write and read estimates: ``identification.json`` and ``motors.yaml``, all files or none."""
 
 import math
 import os
@@ -22,13 +22,13 @@ from smp_motor_ident.result import Estimate, Quantity
 
 SCHEMA = 1
 MAX_VALUE = 1e12
-"""No number of a motor is larger in SI units; squares of larger ones leave the floats."""
+"""Largest accepted value in SI units; squares of larger ones overflow."""
 Rows = list[list[float]]
 POSITIVE_QUANTITIES = ("resistance", "inductance", "motor_constant", "inertia", "dc_gain")
 
 
 def now() -> str:
-    """Return the present time as files bear it."""
+    """Return the present time as written in files."""
     return datetime.now(timezone.utc).strftime("%Y-%m-%d %H:%M UTC")
 
 
@@ -95,7 +95,7 @@ def _read_motor(wheel: str, entry: Any, path: Path) -> Estimate:
 
 
 def _read_interval(bounds: Any) -> Any:
-    """Return an interval whose missing ends, which JSON cannot say, are infinite."""
+    """Return an interval with infinite ends, which are null in JSON."""
     if not isinstance(bounds, list) or len(bounds) != 2:
         return bounds
     return [end if one is None else one for one, end in zip(bounds, (-math.inf, math.inf))]
@@ -129,10 +129,10 @@ def _is_known(quantity: Quantity | None) -> bool:
 
 
 def motor_entry(estimate: Estimate) -> dict[str, float | int]:
-    """Return what ``motor_plant`` needs to know to be this motor.
+    """Return the parameters with which ``motor_plant`` simulates this motor.
 
-    Physical parameters where the data could tell all of them, else the combinations: a motor
-    of the same response from voltage to speed.
+    They are the physical parameters if all are known, else the combinations, which give the same
+    response from voltage to speed.
     """
     parameters = estimate.parameters
     physical = all(_is_known(parameters.get(name)) for name in PHYSICAL[:5])

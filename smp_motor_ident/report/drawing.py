@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A chart as data for the page's script, and as SVG for print and for figures in files."""
+"""Describe charts as data for the script of a page, and draw them as SVG for print and files."""
 
 import base64
 import math
@@ -17,7 +17,7 @@ from smp_motor_ident.report.words import label
 
 WIDTH = 720
 LEFT, RIGHT, TOP, BOTTOM = 64, 12, 8, 40
-POINTS = 600  # more than one point a pixel shows nothing more
+POINTS = 600  # drawn points of a curve, about one a pixel
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,19 +39,19 @@ class Chart:
     """Curves over one x."""
 
     name: str  # identifier in the page
-    # title, x_label, y_label: in words, with units
+    # title, x_label, y_label: with units
     title: str
     x_label: str
     y_label: str
     x: Array  # shape (n,): increasing
     curves: tuple[Curve, ...]
     log: str = ""
-    lines: tuple[float, ...] = ()  # levels that are marked
+    lines: tuple[float, ...] = ()  # marked levels
     # Stretches of x with the CSS variable that shades them
     spans: tuple[tuple[float, float, str], ...] = ()
     group: str = ""  # charts of one group share cursor and zoom in x
     height: int = 220
-    view: tuple[float, float] | None = None  # stretch of x that a screen shows at first
+    view: tuple[float, float] | None = None  # range of x that a screen shows at first
     summary: str = ""  # description of the chart for screen readers
 
 
@@ -126,7 +126,7 @@ def _draw_path(way: str, color: str, more: str = "") -> str:
 
 
 class _Plane:
-    """From the chart's units to the drawing's."""
+    """Conversion from the units of a chart to those of the drawing."""
 
     def __init__(self, chart: Chart) -> None:
         self.chart = chart

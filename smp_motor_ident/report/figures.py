@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The charts of one motor: fit over the data, residual correlations, frequency response."""
+"""Make the charts of one motor: fit, residual correlations, frequency response."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -12,10 +12,12 @@ from smp_motor_ident.report.drawing import Chart, Curve, thin
 from smp_motor_ident.report.words import label
 from smp_motor_ident.result import ResidualTests
 
-MAX_POINTS = 8000  # of a curve over time; zoomed in tenfold that is still one a pixel
-VIEW_LAGS = 80.0  # lags of the motor that a screen shows at first: single answers are seen there
+MAX_POINTS = 8000  # points of a curve over time: one a pixel when zoomed in tenfold
+VIEW_LAGS = (
+    80.0  # time constants that a screen shows at first, so that single responses are visible
+)
 MIN_COHERENCE = 0.6
-"""Below this coherence most of the spectrum at a frequency is not the response to the voltage."""
+"""Smallest coherence of a shown frequency; below it most of the spectrum is no response."""
 
 MAX_MISSING_INTERVALS = 20.0  # missing intervals after which a new spectrum begins
 
@@ -26,7 +28,7 @@ Role = Literal["estimation", "validation"]
 class Comparison:
     """Measured against simulated motor speed over one stretch of data."""
 
-    role: Role  # whether the model was fitted to this stretch or only judged by it
+    role: Role  # whether the model was fitted to this stretch
     source: str  # name of the bag
     time: Array  # shape (n,), [s]: from the stretch's start
     # voltage, measured, simulated: shape (n,), [V, rad/s, rad/s]: at the motor shaft; NaN where
@@ -37,7 +39,7 @@ class Comparison:
 
 
 def fit_charts(wheel: str, parts: Sequence[Comparison], lag: float = 0.0) -> list[Chart]:
-    """Return speed, residual and voltage over all stretches; shown first is the liveliest part."""
+    """Return speed, residual and voltage over all stretches; the view begins at the liveliest."""
     begin, times, spans = 0.0, [], []
     for part in parts:
         times.append(begin + part.time)
@@ -85,7 +87,7 @@ def _find_liveliest(
 
 
 def residual_charts(wheel: str, tests: ResidualTests) -> list[Chart]:
-    """Return the correlations that the residual tests have judged, with the tests' own bands."""
+    """Return the correlations of the residual tests, with their bands."""
     charts = []
     for kind, found in (
         ("autocorrelation", tests.autocorrelation),
@@ -114,8 +116,8 @@ def residual_charts(wheel: str, tests: ResidualTests) -> list[Chart]:
 def frequency_charts(wheel: str, parts: Sequence[Comparison]) -> list[Chart]:
     """Return gain and phase from voltage to speed, of the data and of the model.
 
-    Both are estimated in the same way from the same voltage, so that friction, the hold and the
-    sampling act on both alike; where they part beyond the band, the model misses something.
+    Both are estimated in the same way from the same voltage, so friction, hold and sampling affect
+    both alike.  A difference beyond the band shows an effect that the model lacks.
     """
     found = _estimate_response(parts)
     if found is None:
@@ -154,7 +156,7 @@ def _split_at_pauses(part: Comparison, step: float) -> list[tuple[Array, ...]]:
 
 
 def _estimate_response(parts: Sequence[Comparison]) -> tuple[Array, Array, Array, Array] | None:
-    """Return frequencies, response of data and model, and 95 % of the log of the former.
+    """Return frequencies, responses of data and model, and the 95 % band of the log of the data's.
 
     References
     ----------

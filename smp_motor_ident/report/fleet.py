@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Many recordings in one table: robots, wheels and dates, what drifts and what stands out."""
+"""Tabulate many recordings by robot, wheel and date; find drifts and outliers."""
 
 import csv
 import io
@@ -25,21 +25,21 @@ DAY = 86400.0
 class Row:
     """One motor in one recording."""
 
-    # robot, wheel, source: whose it is, and the recording
+    # robot, wheel, source: name of each, and of the recording
     robot: str
     wheel: str
     source: str
     date: float | None  # when it was recorded [s since 1970], by its own stamps
     values: Mapping[str, Quantity]  # compared quantities by name
-    fit_percent: float | None = None  # of the speed in held-out data; None without such data
-    unreliable: bool = False  # whether the identification calls itself so
-    failure: str = ""  # why there are no values
-    lost: bool = False  # whether that was not the recording's fault: the next run tries it again
+    fit_percent: float | None = None  # fit on held-out data; None without such data
+    unreliable: bool = False  # whether the identification is unreliable
+    failure: str = ""  # reason for missing values
+    lost: bool = False  # whether the failure is not due to the recording, so the next run retries
 
 
 @dataclass(frozen=True)
 class Mark:
-    """Something that stands out: a drift of one motor, or a motor unlike the others."""
+    """A drift of one motor, or an outlier among the robots."""
 
     kind: str
     robot: str
@@ -49,12 +49,12 @@ class Mark:
 
 
 def name_motor(row: Row | Mark) -> str:
-    """Return whose motor it is."""
+    """Return robot and wheel of a motor."""
     return f"{row.robot}, {words.label_in_sentence(row.wheel)}" if row.wheel else row.robot
 
 
 def drifts(rows: Sequence[Row]) -> list[Mark]:
-    """Return which motors change with time, by a straight line through their values.
+    """Return the motors that change with time, by a straight line through their values.
 
     The standard deviation of the slope is the larger of that from the stated deviations and that
     from the scatter around the line.  Systematic errors are common to all recordings and left out.
@@ -66,7 +66,7 @@ def drifts(rows: Sequence[Row]) -> list[Mark]:
         value, std = _read_values(held, name)
         if len(held) < 3 or np.ptp(day) == 0 or not np.all(std > 0):
             continue
-        middle = np.average(day, weights=std**-2.0)  # there the line is at the mean
+        middle = np.average(day, weights=std**-2.0)  # where the line has the mean value
         (slope, mean), stated = np.polyfit(day - middle, value, 1, w=1 / std, cov="unscaled")
         rest = (value - mean - slope * (day - middle)) / std
         scatter = max(1.0, float(np.sum(rest**2)) / (len(held) - 2))
@@ -89,7 +89,7 @@ def _read_values(rows: Sequence[Row], name: str) -> tuple[Array, Array]:
 
 
 def outliers(rows: Sequence[Row]) -> list[Mark]:
-    """Return which motors differ from the same wheel of the other robots.
+    """Return the motors that differ from the same wheel of the other robots.
 
     Each robot's last value against the median of the robots, in units of their scatter
     (1.4826 times the median deviation, but at least the value's own standard deviation).
@@ -158,7 +158,7 @@ def table(rows: Sequence[Row]) -> tuple[str, bytes]:
 
 
 def describe(row: Row) -> str:
-    """Return what came out for one motor in one recording, in a line."""
+    """Return the result of one motor in one recording, in a line."""
     if row.failure:
         return row.failure
     numbers = (f"{words.label_in_sentence(n)} {words.state(q)}" for n, q in row.values.items())
@@ -168,7 +168,7 @@ def describe(row: Row) -> str:
 
 
 def page(rows: Sequence[Row], marks: Sequence[Mark]) -> str:
-    """Return the table as a page that stands alone."""
+    """Return the table as a self-contained page."""
     known = [name for name in QUANTITIES if any(name in row.values for row in rows)]
     units = {name: words.scaled(Quantity(None, unit=UNITS[name])).unit for name in known}
     dates = sorted(row.date for row in rows if row.date is not None)

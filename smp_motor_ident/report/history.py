@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What `identifier` has seen of commissioned motors over the days: lines of a file, and charts.
+"""Store and draw the live estimates of `identifier` over days.
 
-Each line is a JSON object: stamp [s], wheel, values (by name value and standard deviation),
-validity and codes of findings.  A file is only ever added to, so a crash loses a line at most.
+Each line of the file is a JSON object: stamp [s], wheel, values with standard deviations, and codes
+of findings.  Lines are only appended, so a crash loses one line at most.
 """
 
 import json
@@ -52,7 +52,7 @@ def append(path: Path, entries: Sequence[Entry]) -> None:
 
 
 def read(path: Path) -> dict[str, list[Entry]]:
-    """Return the entries of each wheel by their stamps, without a last line that was cut off."""
+    """Return the entries of each wheel by their stamps; a truncated last line is left out."""
     out: dict[str, list[Entry]] = {}
     lines = path.read_text("utf-8").splitlines()
     for number, line in enumerate(lines, 1):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The page ``report.html``: one file that needs nothing else, for a reader who was not there."""
+"""Make ``report.html``: one self-contained page."""
 
 from __future__ import annotations
 
@@ -20,18 +20,18 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Report:
-    """All that the page tells."""
+    """Content of the page."""
 
     estimates: Mapping[str, Estimate]  # by wheel
     # Measured and simulated speed by wheel
     comparisons: Mapping[str, Sequence[Comparison]] = field(default_factory=dict)
     # Wheels that could not be identified, each with the reason
     failures: Mapping[str, str] = field(default_factory=dict)
-    # How the page came about: command, sources, date, versions
+    # Command, sources, date and versions behind the page
     provenance: Mapping[str, str] = field(default_factory=dict)
     # Tuning page by wheel; empty for a report without one
     tunings: Mapping[str, Tuning] = field(default_factory=dict)
-    # By wheel what `identifier` has seen since
+    # Charts of later estimates by `identifier`, by wheel
     history: Mapping[str, Sequence[Chart]] = field(default_factory=dict)
     folder: str = "."  # that the results are written to
 
@@ -102,7 +102,7 @@ def _list_components(estimate: Estimate) -> list[str]:
 
 
 def _describe_gains(estimate: Estimate, report: Report) -> tuple[str, str]:
-    """Return the gains of a tuning in words, or how to get them and the command that does it."""
+    """Return the gains of a tuning in words, or advice and the command that designs them."""
     tuning = report.tunings.get(estimate.wheel)
     if tuning is None:
         return summary.advise_tuning(estimate, report.folder)
@@ -114,7 +114,7 @@ def _describe_gains(estimate: Estimate, report: Report) -> tuple[str, str]:
 
 
 def _describe_quantity(name: str, quantity: Quantity, doubt: int | None) -> dict[str, Any]:
-    """Return one line of a table of quantities, in words; ``doubt`` is the message against it."""
+    """Return one row of a table of quantities; ``doubt`` is the number of a message against it."""
     _, symbol, title, meaning = QUANTITIES.get(name, ("", "", words.label(name), ""))
     return dict(
         symbol=symbol,

@@ -8,12 +8,12 @@ from smp_motor_ident.finding import SEVERITIES, Finding
 from smp_motor_ident.report.words import is_stated, label_in_sentence, to_sentence
 from smp_motor_ident.result import Estimate, Quantity
 
-MAX_MESSAGES = 3  # so many are shown of a motor without being asked for; more are not read
+MAX_MESSAGES = 3  # largest number of messages shown unfolded for a motor
 
 
 @dataclass(frozen=True)
 class Message:
-    """A finding as it is told, with its number among those of the motor, from 1."""
+    """A finding in words, with its number among those of the motor, from 1."""
 
     number: int
     severity: str
@@ -22,7 +22,7 @@ class Message:
 
 
 def select_messages(estimate: Estimate) -> tuple[list[Message], list[Message]]:
-    """Return the messages that are shown of a motor, the gravest first, and all others."""
+    """Return the messages that are shown for a motor, the gravest first, and the folded ones."""
     told = [
         Message(k, finding.severity, to_sentence(finding.message), to_sentence(finding.advice))
         for k, finding in enumerate(_by_severity(estimate), 1)
@@ -36,24 +36,24 @@ def _by_severity(estimate: Estimate) -> list[Finding]:
 
 
 def _list_stated(estimate: Estimate) -> list[str]:
-    """Return the names of all numbers, and ranges that are left open, of a motor."""
+    """Return the names of the quantities of a motor that have a value or a range."""
     every = {**estimate.combinations, **estimate.parameters}
     return [name for name, quantity in every.items() if is_stated(quantity)]
 
 
 def find_doubted(estimate: Estimate) -> dict[str, int]:
-    """Return the quantities that may be off by more than is stated, each with its message."""
+    """Return the unreliable quantities, each with the number of its message."""
     doubted, known = dict[str, int](), _list_stated(estimate)
     for number, finding in enumerate(_by_severity(estimate), 1):
         if finding.severity in ("unreliable", "refused"):
-            # One that names no quantity concerns all.
+            # A finding that names no quantity concerns all.
             affected = [name for name in known if name in finding.quantities] or known
             doubted = {**dict.fromkeys(affected, number), **doubted}
     return doubted
 
 
 def judge(estimate: Estimate) -> tuple[str, str]:
-    """Return how far to trust a motor: ``good``, ``fair`` or ``poor``, and why in a few words."""
+    """Return the grade of a motor, ``good``, ``fair`` or ``poor``, and the verdict in words."""
     percent = estimate.fit_percent.validation
     if estimate.unreliable:
         doubted = find_doubted(estimate)
@@ -67,7 +67,7 @@ def judge(estimate: Estimate) -> tuple[str, str]:
 
 
 def describe_fit(estimate: Estimate) -> str:
-    """Return how well the simulated speed fits the measured one."""
+    """Return the fit of the simulated speed in words."""
     known = (
         (estimate.fit_percent.validation, "on held-out data"),
         (estimate.fit_percent.estimation, "on the data of the fit"),
@@ -77,15 +77,15 @@ def describe_fit(estimate: Estimate) -> str:
 
 
 def advise_tuning(estimate: Estimate, folder: str) -> tuple[str, str]:
-    """Return what to say of gains, and the command that designs them from the results' folder."""
+    """Return advice on gains, and the command that designs them from the folder of results."""
     if estimate.combinations.get("dc_gain", Quantity(None)).value is None:
-        return "No gains: these data do not tell the DC gain.", ""
+        return "No gains: these data do not determine the DC gain.", ""
     command = f"tune {shlex.quote(folder)} --output gains.yaml"
     if not estimate.hardware.supply_voltage:
         command += " --supply VOLTS"
     if estimate.unreliable:
         return (
-            "Design gains, slow ones for unreliable numbers, with",
+            "Design gains, slow ones because the estimate is unreliable, with",
             f"{command} --accept-unreliable",
         )
     return "Design gains with", command

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Pages that stand alone: a template, with all that it needs in itself."""
+"""Render self-contained pages from templates."""
 
 import re
 from collections.abc import Sequence
@@ -16,7 +16,7 @@ from smp_motor_ident.report.drawing import Chart, packed, svg
 
 
 def page(name: str, charts: Sequence[Chart] | None = None, **content: Any) -> str:
-    """Return a page by its template, with the script for ``charts``; content must be complete."""
+    """Return a page by its template, with the script for ``charts`` if there are any."""
     style = text("colors.css") + text("report.css")
     if charts is not None:
         style = text("uplot/uPlot.min.css") + style
@@ -74,7 +74,7 @@ def text(name: str) -> str:
 
 
 def script_data(content: Any) -> Markup:
-    """Return data for a script element, which nothing in it may end."""
+    """Return data for a script element, without a ``<`` that could end it."""
     return Markup(encode(content).replace("<", "\\u003c"))
 
 

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Designs drawn: the figure of a tuning, and the page of designs over bandwidth and phase margin.
+"""Make the tuning page: designs over bandwidth and phase margin, and their charts.
 
-Nothing of control is computed in the page; its sliders choose among these designs.
+The page computes nothing; its sliders choose among these designs.
 """
 
 import math
@@ -32,13 +32,13 @@ from smp_motor_ident.tune.ensemble import Robustness
 from smp_motor_ident.tune.feedback import Feedback
 
 BANDWIDTH_SHARES = (0.3, 0.45, 0.65, 0.85, 1.0)
-"""Of the bandwidth that the method chooses by itself, which is the largest integral gain's."""
+"""Offered bandwidths, as shares of the one with the largest integral gain."""
 
-PHASE_MARGINS = (45.0, 60.0, 70.0)  # phase margins that are offered [deg]: lively, usual, calm
-DEFAULT_PHASE_MARGIN = 60.0  # what `tune` takes [deg]
+PHASE_MARGINS = (45.0, 60.0, 70.0)  # offered phase margins [deg]: lively, usual, calm
+DEFAULT_PHASE_MARGIN = 60.0  # that of `tune` [deg]
 MAX_SENSITIVITY = METHODS["margin"].required.sensitivity
 
-BAND_DRAWS = 100  # motors that the bands of a choice are over: their ends are the least and largest
+BAND_DRAWS = 100  # motors behind the bands of a choice, whose ends are their extremes
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,7 +66,7 @@ class Tuning:
 def design_all_wheels(
     estimates: Mapping[str, Estimate], loops: Mapping[str, Loop]
 ) -> tuple[Mapping[str, Design], dict[str, Tuning]]:
-    """Return the designs of ``tune``, all wheels together, and the wheels that have none."""
+    """Return the designs of all wheels together, and the wheels without a design."""
     refused: dict[str, Tuning] = {}
     while left := {w: one for w, one in estimates.items() if w not in refused}:
         try:
@@ -92,7 +92,7 @@ def _explain_refusals(
 
 
 def design_tuning(estimate: Estimate, loop: Loop, own: Design) -> Tuning:
-    """Design one wheel's controller at every place of the sliders, around that of ``tune``."""
+    """Design the controller of one wheel for all positions of the sliders."""
     choices = [
         Choice(share * own.margins.crossover, margin, own, curves(estimate, own))
         if share == BANDWIDTH_SHARES[-1] and margin == DEFAULT_PHASE_MARGIN
@@ -110,13 +110,13 @@ def design_tuning(estimate: Estimate, loop: Loop, own: Design) -> Tuning:
 
 
 def choose(estimate: Estimate, loop: Loop, bandwidth: float, margin: float, own: Design) -> Choice:
-    """Design for a bandwidth [rad/s] and a phase margin [deg], at the pace of ``own``."""
+    """Design for a bandwidth [rad/s] and a phase margin [deg], with the reference of ``own``."""
     asked = dict(bandwidth=bandwidth, phase_margin=margin)
     return _finish_choice(estimate, loop, Choice(bandwidth, margin), own, asked, solve)
 
 
 def judge(estimate: Estimate, own: Design, feedback: Feedback) -> Choice:
-    """Return what gains that were set by hand do, at the pace of ``own``."""
+    """Return the figures of gains set by hand, with the reference of ``own``."""
 
     def given(case: Case) -> tuple[Feedback, float, Robustness]:
         return assess(case, feedback)
@@ -139,7 +139,7 @@ def _finish_choice(
 
 
 def page_charts(tunings: Mapping[str, Tuning]) -> list[Chart]:
-    """Return the charts as they stand before a slider is moved: of the first wheel."""
+    """Return the charts of the first wheel, which the page shows at first."""
     for tuning in tunings.values():
         if tuning.choices:
             one = tuning.choices[tuning.chosen]
@@ -149,7 +149,7 @@ def page_charts(tunings: Mapping[str, Tuning]) -> list[Chart]:
 
 
 def page_data(tunings: Mapping[str, Tuning]) -> dict[str, Any]:
-    """Return the data of the page's script: by wheel the designs at every place of the sliders."""
+    """Return the data of the page's script: the designs of each wheel."""
     return {
         "shares": BANDWIDTH_SHARES,
         "margins": PHASE_MARGINS,
@@ -161,7 +161,7 @@ def page_data(tunings: Mapping[str, Tuning]) -> dict[str, Any]:
 
 
 def describe(one: Choice) -> dict[str, Any]:
-    """Return a choice as the page's script takes it."""
+    """Return a choice as data for the page's script."""
     asked = {"bandwidth": f"{one.bandwidth:.4g}", "margin": f"{one.phase_margin:g}"}
     if one.design is None or one.curves is None:
         return {**asked, "reason": one.reason}
@@ -216,7 +216,7 @@ def _format_band(band: specification.Band, scale: float, unit: str) -> tuple[str
 
 def tuning_charts(wheels: Mapping[str, Curves], limit: float, prefix: str = "") -> list[Chart]:
     """Return the charts of the designs of all wheels, each name with a prefix."""
-    # Wheels of different time constants are computed over different lengths and bands.
+    # Wheels with different time constants have different time and frequency axes.
     longest = max(wheels.values(), key=lambda c: float(c.time[-1]))
     time = longest.time
     omega = np.unique(np.concatenate([c.omega for c in wheels.values()]))

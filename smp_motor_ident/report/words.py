@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Numbers, names and messages in the reader's words, the same on the terminal and on pages."""
+"""Format numbers, names and messages, alike on the terminal and on pages."""
 
 import math
 import re
@@ -31,12 +31,12 @@ CAUSES: Mapping[str, str] = {
     "smoothed_current": "current smoothing",
     "stribeck": "Stribeck",
 }
-"""Causes of systematic uncertainty whose codes are not the words for them."""
+"""Words for causes of systematic uncertainty that differ from their codes."""
 
 SCALES = {"s": ("ms", 1e3), "s^2": ("ms^2", 1e6), "H": ("mH", 1e3), "N m": ("mN m", 1e3)}
 """Display units for small values, and their factors."""
 
-MAX_DIGITS = 9  # of a number: more are those of a simulation without noise
+MAX_DIGITS = 9  # largest number of digits, for simulations without noise
 
 
 def label(name: str) -> str:
@@ -47,7 +47,7 @@ def label(name: str) -> str:
 
 
 def label_in_sentence(name: str) -> str:
-    """Return a quantity as it is written within a sentence."""
+    """Return the name of a quantity within a sentence."""
     text = label(name)
     proper = text[:2].isupper() or text.startswith("Coulomb")
     return text if proper else text[0].lower() + text[1:]
@@ -72,7 +72,7 @@ def _format_two_digits(value: float) -> str:
 
 
 def state(quantity: Quantity, with_unit: bool = True) -> str:
-    """Return a number with ± one standard deviation and unit, or the range that is left open."""
+    """Return a number with ± one standard deviation and unit, or else its possible range."""
     shown = scaled(quantity)
     if shown.value is None:
         text = interval(quantity)
@@ -84,7 +84,7 @@ def state(quantity: Quantity, with_unit: bool = True) -> str:
 
 
 def interval(quantity: Quantity) -> str:
-    """Return the 95 % interval of a number, or the range that is left open, in the unit shown."""
+    """Return the 95 % interval of a number or its possible range, in the displayed unit."""
     shown = scaled(quantity)
     if shown.ci95 is None:
         return "—"
@@ -137,12 +137,12 @@ def cause(name: str) -> str:
 
 
 def format_unit(unit: str) -> str:
-    """Return a unit as one prints it."""
+    """Return a unit in print."""
     return unit.replace("^2", "²").replace("ohm", "Ω")
 
 
 def scaled(quantity: Quantity) -> Quantity:
-    """Return a quantity in the unit that people use for its size, such as a time in ms."""
+    """Return a quantity in its display unit, such as a time in ms."""
     unit, factor = SCALES.get(quantity.unit, (quantity.unit, 1.0))
     value, std = (None if one is None else one * factor for one in (quantity.value, quantity.std))
     ci95 = quantity.ci95 and (quantity.ci95[0] * factor, quantity.ci95[1] * factor)
@@ -151,17 +151,17 @@ def scaled(quantity: Quantity) -> Quantity:
 
 
 def date(seconds: float) -> str:
-    """Return a time since 1970 as files bear it."""
+    """Return a time since 1970 as a date."""
     return datetime.fromtimestamp(seconds, timezone.utc).strftime("%Y-%m-%d %H:%M UTC")
 
 
 def is_stated(quantity: Quantity) -> bool:
-    """Return whether there is a number or a range to state."""
+    """Return whether a quantity has a number or a range."""
     return quantity.value is not None or quantity.ci95 is not None
 
 
 def status(quantity: Quantity) -> str:
-    """Return in words where a number comes from."""
+    """Return the status of a quantity in words."""
     words = {"estimated": "estimated", "fixed": "given", "unidentifiable": "not identifiable"}
     return words[quantity.status]
 

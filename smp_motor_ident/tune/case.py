@@ -37,12 +37,12 @@ from smp_motor_ident.tune.problem import Method, Problem, RequiredMargins, check
 from smp_motor_ident.tune.unmodelled import describe_known_band, unmodelled_dynamics
 
 MAX_CONTROL_NOISE = 1 / 6
-"""Largest control noise [share of the supply, rms] of any gains: three times it is half of the
-supply, and clamped noise opens the loop."""
+"""Largest control noise [share of the supply, rms] of any gains: three standard deviations are half
+of the supply, and clamped noise opens the loop."""
 
 
 WORK, MIN_DRAWS = 5e7, 50
-"""Draws times the cube of the loop's states that is spent at most; and least draws."""
+"""Largest product of draws and cubed number of states, and smallest number of draws."""
 
 COMMON_TARGETS = (
     "max_velocity", "max_acceleration", "transition_time", "together", "samples", "seed",
@@ -60,25 +60,25 @@ class Case:
     problem: Problem  # the nominal motor and the targets
     required: RequiredMargins  # margins that the gains must keep
     ensemble: UncertaintyEnsemble  # motors within the uncertainty
-    drawn: bool  # whether these were drawn; else the ensemble is the nominal motor alone
+    drawn: bool  # False where the ensemble is the nominal motor alone
     friction: Friction  # range of the dry friction
     driver: Driver  # effects of its driver
-    load: float  # that is always there, either way [V]
-    torque_noise: float  # load that fluctuates, over a sample [V rms]
-    scatter: float  # of the instants of commands and samples [s rms]
-    eccentric: float  # amplitude of the encoder's error once a turn [rad]
-    outliers: float  # share of the reported speed's readings
-    lag_in_doubt: bool  # whether the second lag may be the reported speed's filter
+    load: float  # magnitude of a constant load [V]
+    torque_noise: float  # fluctuating load, averaged over a sample [V rms]
+    scatter: float  # timing jitter of commands and samples [s rms]
+    eccentric: float  # amplitude of the encoder error once a turn [rad]
+    outliers: float  # share of outliers among the readings of the reported speed
+    lag_in_doubt: bool  # whether the second lag may be a filter of the reported speed
     findings: tuple[Finding, ...]  # about the estimate
 
     @property
     def lost_voltage(self) -> float:
-        """Voltage [V] that is surely lost before the motor turns, which feed-forward adds."""
+        """Voltage [V] lost to friction and driver at least, which the feed-forward adds."""
         return self.friction.known + self.driver.threshold
 
     @property
     def breakaway(self) -> float:
-        """Least command [V] at which the motor must turn, whatever load there is; the supply's."""
+        """Smallest command [V] at which every motor turns; at most the supply."""
         commands = np.linspace(0.0, self.problem.loop.supply_voltage, 256)
         numbers, lane = self.driver.numbers, self.driver.lane
         volts = [apply_driver(numbers, lane, v, 0.0, v, 1.0)[0] for v in commands.tolist()]
@@ -100,7 +100,7 @@ def prepare(estimate: Estimate, loop: Loop, method: str, targets: dict[str, Any]
     lag = report_sensor_lag(estimate) if loop.reports_speed else None
     level = next((f for f in estimate.findings if f.code == "one_size_of_voltage"), None)
     findings += [one for one in (friction.finding, lag, level) if one is not None]
-    # The reference leaves room for all of it.
+    # The reference leaves room for the whole loss.
     load = abs(estimate.value("load_voltage"))
     lost = friction.planned + driver.threshold + load
     plant = sample(replace(make_motors(estimate), static_voltage=np.array([lost])), loop)
@@ -144,9 +144,9 @@ def prepare(estimate: Estimate, loop: Loop, method: str, targets: dict[str, Any]
 
 
 def _limit_by_driver(driver: Driver, loop: Loop) -> Loop:
-    """Return a loop with its driver's limits: a ramp is late by half of its length.
+    """Return a loop with the limits of its driver; a ramp delays by half of its length.
 
-    The margins bear that; planned changes are no faster than the driver, and not late.
+    The margins cover this delay; planned changes are no faster than the driver and have none.
     """
     supply = min(loop.supply_voltage, driver.limit)
     longest = loop.loop_delay + 0.5 * supply / driver.slew

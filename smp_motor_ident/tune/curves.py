@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A design as curves: responses and frequency responses with the band of the estimate."""
+"""Compute the curves of a design: responses over time and frequency, with bands."""
 
 import math
 from dataclasses import dataclass, replace

@@ -167,7 +167,7 @@ def finish(
 
 
 def settles(case: Case, feedback: Feedback) -> bool:
-    """Tell whether a largest settling time can be stated: the quickest change decides."""
+    """Return whether a largest settling time can be stated for the quickest change."""
     controller = controller_for(case.problem.loop, feedback)
     margins = loop_margins(case.problem.plant, feedback)
     quickest = _plan_change(case, controller, margins)
@@ -227,7 +227,7 @@ def _plan_change(case: Case, controller: Controller, margins: Margins) -> Refere
     plants = [usual]
     if case.lag_in_doubt:
         plants.append(_sample_usual(case, move_lag_to_sensor(usual.motors)))
-    # Require no more tolerance of additional delay than the loop can have.
+    # The doubt on the delay is at most the share that the margins bear.
     doubt = max(loop.delay_doubt, case.scatter)
     borne = replace(loop, delay_doubt=min(doubt, MAX_DELAY_SHARE * margins.delay))
     least = 0.4 / margins.crossover if margins.crossover > 0 else 0.0
@@ -277,7 +277,7 @@ def _explain(
     if factor < 1:
         words.append(
             f"gains reduced to {100 * factor:.0f} % of the rule's, so that 99 % of these motors "
-            "keep the margins and the control noise stays within the clamp"
+            "keep the margins, and the control noise its limit"
         )
     unmodelled = case.problem.unmodelled
     if unmodelled is not None:
@@ -285,7 +285,7 @@ def _explain(
             f"unmodelled dynamics reach {100 * robustness.unmodelled:.0f} % of the loop's bound"
             + describe_known_band(unmodelled, ": ")
         )
-        # Beyond the crossover |T| is as large as the gains: so much of it the rule's had.
+        # Beyond the crossover |T| is proportional to the gains, which the factor has reduced.
         if robustness.unmodelled > MIN_LIMITING_SHARE * min(factor, 1.0):
             findings.append(Finding(
                 "unmodelled_dynamics", "warning",

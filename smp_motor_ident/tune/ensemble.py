@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Check gains for all motors within the uncertainty of the estimate."""
+"""Check gains for the motors within the uncertainty of the estimate."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -21,7 +21,7 @@ class Robustness:
     samples: int  # motors drawn; 0 where the estimate has no uncertainty
     stable: float  # share with a stable loop [0..1]
     holds: float  # share that keeps every required margin [0..1]
-    # phase, gain, sensitivity: phase margin [deg], gain margin [-] and Ms [-] that 99 % keep
+    # phase, gain, sensitivity: phase margin [deg], gain margin [-] and Ms [-] of the worst percent
     phase: float
     gain: float
     sensitivity: float

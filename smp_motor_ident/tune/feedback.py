@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The feedback path of the controller, and the loop that it closes.
+"""Compute the feedback of the controller, and the closed loop.
 
 All at the motor shaft: volts per motor rad/s.  The integral is forward Euler and is used one
 step later, the derivative is backward Euler behind its filter, exactly as the running PID does.

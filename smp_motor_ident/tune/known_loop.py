@@ -23,7 +23,7 @@ Step = Callable[[float, float], float]
 
 INTERVAL_TOLERANCE = 0.5  # relative excess of an interval that indicates a lost sample
 
-DITHER_COUNT = 4
+DITHER_COUNT = 4  # simulations that estimate the error of rounding
 
 
 @dataclass(frozen=True)

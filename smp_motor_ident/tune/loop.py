@@ -16,16 +16,15 @@ class Loop:
     """One wheel's speed loop: sampling, delay, encoder, gearbox and supply."""
 
     sample_time: float = 0.005  # interval of the controller's steps [s]
-    # From the stamp of a measurement to the instant at which the voltage answering it is applied,
-    # beyond the hold and a delay of the motor itself [s]; None: one sample, which every node that
-    # answers within its period keeps
+    # From the stamp of a measurement until its voltage is applied, without hold, motor [s]; None:
+    # one sample, the delay of a node that answers within its period
     delay: float | None = None
-    # The same as it usually is [s], for the timing of the reference, where ``delay`` is the longest
-    # that the margins must bear; None: ``delay``
+    # Usual value of this delay [s], for the timing of the reference; ``delay`` is the longest one,
+    # which the margins cover; None: ``delay``
     usual_delay: float | None = None
-    delay_doubt: float = 2e-3  # more delay that may not cause significant overshoot [s]
+    delay_doubt: float = 2e-3  # additional delay without significant overshoot [s]
     gear_ratio: float = 65.5  # motor revolutions per wheel revolution [-]
-    # Of the encoder, per motor revolution; None where speed is not made from counts
+    # Counts of the encoder per motor revolution; None if the speed is not made from counts
     counts_per_revolution: float | None = 500.0
     supply_voltage: float = 12.0  # largest voltage of either sign [V]
     # The speed in the message, counts differenced over ``difference_window``, or the observer's
@@ -35,7 +34,7 @@ class Loop:
     difference_window: int = 1
     noise_voltage: float | None = None  # largest control noise [V rms]; None: 4 % of the supply
     speed_noise: float = 0.0  # of a reported speed, with its rounding [rad/s rms, motor]
-    speed_step: float = 0.0  # in which a reported speed comes [rad/s, motor]
+    speed_step: float = 0.0  # resolution of a reported speed [rad/s, motor]
     angle_noise: float = 0.0  # of the angle behind the speed, before counting [rad rms, motor]
     # Whether ``difference_window`` holds for a reported speed whatever averaging was identified
     averaging_given: bool = False
@@ -66,7 +65,7 @@ class Loop:
 
     @property
     def reports_speed(self) -> bool:
-        """Whether the speed of the message is fed back, with all that its sensor does to it."""
+        """Whether the reported speed is fed back, with the dynamics of its sensor."""
         return self.speed_source == "measured"
 
     @property

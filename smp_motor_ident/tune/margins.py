@@ -20,7 +20,7 @@ from smp_motor_ident.tune.plant import Plant
 
 TINY = float(np.finfo(np.float64).tiny)
 ROUNDING = 1e-9
-"""Response [-] that stands for zero: an average over an even window has one at Nyquist."""
+"""Response [-] that counts as zero: an average over an even window has a zero at Nyquist."""
 
 
 @dataclass(frozen=True)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Motors for the design: parameters of the response, and random draws of them."""
+"""Convert an estimate to motors for the design, and draw uncertain ones."""
 
 import math
 from dataclasses import dataclass, field, fields, replace
@@ -49,7 +49,7 @@ class Motors:
 class Friction:
     """Range of dry friction, as a voltage."""
 
-    known: float  # what surely is there, which feed-forward may overcome [V]
+    known: float  # friction that the feed-forward compensates [V]
     # low, high: its range [V]
     low: float
     high: float
@@ -62,10 +62,10 @@ class Friction:
 
 
 def bound_friction(estimate: Estimate, supply: float) -> Friction:
-    """Return the dry friction that feed-forward may rely on."""
+    """Return the range of dry friction, and the part that the feed-forward compensates."""
     quantity = _find_static_voltage(estimate)
     if quantity is None:
-        words = "dry friction was not identified: the feed-forward leaves it to the integral"
+        words = "dry friction was not identified, so the integral alone compensates it"
         return Friction(0.0, 0.0, 0.0, Finding("friction_unknown", "warning", words))
     if quantity.value is None or not math.isfinite(quantity.std or 0.0):
         low, high = (0.0, supply) if quantity.ci95 is None else quantity.ci95
@@ -78,16 +78,16 @@ def bound_friction(estimate: Estimate, supply: float) -> Friction:
     low, high = max(low, 0.0), high if quantity.total_std == 0.0 else min(high, supply)
     if high - low > MAX_FRICTION_RANGE * supply:
         raise DesignError(
-            f"{estimate.wheel}: dry friction may take anything from {low:.3g} to {high:.3g} V of "
-            f"the {supply:g} V supply, so that gain and friction are known as a combination only; "
-            "record the motor at two or more voltages in both directions, through standstill, and "
-            "identify it again"
+            f"{estimate.wheel}: dry friction may be anything from {low:.3g} to {high:.3g} V of the "
+            f"{supply:g} V supply, so only a combination of gain and friction is known; record the "
+            "motor at two or more voltages in both directions, through standstill, and identify it "
+            "again"
         )
     if high - low <= 2 * MAX_FRICTION_ERROR * supply and quantity.value is not None:
         return Friction(quantity.value, low, high)
     words = (
         f"dry friction is only known to lie between {low:.3g} and {high:.3g} V: the feed-forward "
-        f"takes {low:.3g} V of it, the integral does the rest"
+        f"compensates {low:.3g} V, the integral the rest"
     )
     advice = "record voltages of both signs through standstill, slowly changing ones among them"
     evidence = {"low": low, "high": high}
@@ -104,7 +104,7 @@ def _find_static_voltage(estimate: Estimate) -> Quantity | None:
 
 
 def make_motors(estimate: Estimate) -> Motors:
-    """Return the motor of an estimate, from whatever combinations or parameters it holds."""
+    """Return the motor of an estimate, from its combinations or else its parameters."""
     return _convert_values(
         estimate, {name: np.array([estimate.value(name)]) for name in _list_quantities(estimate)}
     )
@@ -116,8 +116,8 @@ def draw_motors(
     """Draw motors from the distribution of the estimation error.
 
     Positive quantities are drawn log-normally, quantities that may be zero normally and clipped
-    there.  An unreliable estimate is drawn at least as wide as its unexplained share.  A second lag
-    that the record hides is uniform over its range.
+    at zero.  The spread of an unreliable estimate is at least its unexplained share.  A second lag
+    without a stated value is uniform over its range.
     """
     names = _list_quantities(estimate)
     mean = np.array([estimate.value(name) for name in names])

@@ -2,12 +2,12 @@
 r"""Sampled motor with exact zero-order hold and a delay of any length.
 
 A batch of ``n`` motors :math:`e^{-sD} / (a_2 s^2 + a_1 s + a_0)` is sampled at once, so that
-one motor and a thousand draws of an uncertain one are the same few array operations.  How the
-speed is reported is part of it: filtered, averaged over a window, or observed.
-Everything here is at the motor shaft.
+one motor and a thousand draws of an uncertain one are the same few array operations.  The plant
+includes the sensor of the speed: a filter, an average over a window, or an observer.
+All quantities are at the motor shaft.
 
-The observer in the loop is a linear filter of angle and voltage.  Its angle only ever appears as
-its difference ``e`` from the counted one, so the filter has no state that grows.  With
+The observer is a linear filter of angle and voltage.  Its state holds the difference ``e`` of its
+angle from the counted one, so that no state grows.  With
 ``r = (speed, acceleration, load)`` and, over one sample, the angle ``s`` that was swept and the
 mean voltage ``v``,
 
@@ -43,7 +43,7 @@ SPEED = 1  # where the speed is in the state
 
 @dataclass(frozen=True, eq=False)
 class ObserverModel:
-    """The observer as a filter, which is the same for all motors of a batch."""
+    """The observer as a linear filter, the same for all motors of a batch."""
 
     advance: Array  # shape (q, q)
     # by_angle, by_voltage: shape (q,)
@@ -52,7 +52,7 @@ class ObserverModel:
     # shape (m,): shares of the last controller outputs in the mean voltage of a sample, as the
     # observer gets it and shifts it by the delay of its model
     taps: Array
-    variance: float = 1.0  # of the innovation, as the observer takes it [rad^2]
+    variance: float = 1.0  # assumed variance of the innovation [rad^2]
 
     def transfer(self, z: Complex) -> tuple[Complex, Complex]:
         """Return the transfer from swept angle and from mean voltage to the observed speed."""
@@ -68,7 +68,7 @@ NO_OBSERVER = ObserverModel(np.zeros((0, 0)), np.zeros(0), np.zeros(0), np.zeros
 
 @dataclass(frozen=True, eq=False)
 class Plant:
-    r"""A batch of sampled motors with their delay and the way their speed is measured.
+    r"""A batch of sampled motors with their delay and the sensor of their speed.
 
     ``x[k+1] = phi x[k] + sum_j taps[j] u[k-j]`` with ``x = (speed, acceleration)``, last
     the filtered speed where the sensor has a lag; the angle run through in the step is
@@ -104,7 +104,7 @@ class Plant:
 
     @property
     def sensor(self) -> int:
-        """Which state is reported as the speed."""
+        """Index of the state that is reported as the speed."""
         return self.phi.shape[1] - 1 if np.any(self.motors.sensor_lag > 0) else 0
 
     def response(self, omega: Array, *, true_speed: bool = False) -> Complex:
@@ -144,7 +144,7 @@ class Plant:
         return predicted
 
     def angle_noise(self, omega: Array) -> Array:
-        """Return how an error of the counted angle shows in the speed of the first motor."""
+        """Return the power gain from an error of the angle to the speed of the first motor."""
         z = np.exp(1j * np.asarray(omega) * self.sample_time)
         if self.observer is not None:
             squared: Array = np.abs(self.observer.transfer(z)[0] * (z - 1)) ** 2
@@ -282,7 +282,7 @@ def _hold(motors: Motors, t: Array) -> tuple[Array, Array, Array, Array]:
 
 
 def _resolvent(phi: Array, z: Complex, drive: Complex) -> Complex:
-    """Return (z I - phi)^-1 drive for a batch; a sensor's state, the last of three, is fed only."""
+    """Return (z I - phi)^-1 drive for a batch; the last of three states, a sensor's, feeds none."""
     if phi.shape[1] == 3:
         inner = _resolvent(phi[:, :2, :2], z, drive[:, :2])
         last = np.einsum("ns,nsf->nf", phi[:, 2, :2], inner) + drive[:, 2]

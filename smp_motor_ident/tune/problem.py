@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Input of every tuning method: the sampled plant, its reductions and its noise."""
+"""Define the problem of every tuning method: sampled plant, its reductions and its noise."""
 
 import math
 from collections.abc import Callable, Mapping
@@ -93,7 +93,7 @@ class Problem:
         return noise_density(self.plant, self.loop, self.omega)
 
     def noise_rms(self, response: Complex) -> Array:
-        """Return the rms that measurement noise causes by responses to it, shape (..., f)."""
+        """Return the rms of measurement noise behind some responses of shape (..., f)."""
         power = np.trapezoid(np.abs(response) ** 2 * self.noise, self.omega, axis=-1)
         return np.asarray(np.sqrt(power / self.omega[-1]))
 
@@ -167,7 +167,7 @@ class Method:
 
 
 def compute_measured_lag(plant: Plant, delay: float) -> float:
-    """Return how much later than the motor's speed the measurement shows it [s]."""
+    """Return the lag of the measured speed behind that of the motor [s]."""
     late = delay + float(plant.motors.delay[0])
     if plant.window:
         late += 0.5 / float(plant.average[0, 0])

@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-r"""Feed-forward and reference: what makes wheels arrive together and without overshoot.
+r"""Plan feed-forward and reference, so that wheels arrive together and without overshoot.
 
 The feed-forward is the motor's own equation, ``a2 r'' + a1 r' + a0 r`` and dry friction, of the
-reference r.  The wheel then follows r, and the measurement shows it later by a lag that is known:
-delay and averaging of the loop.  The error is taken from the reference of that long ago,
-so the feedback, its integral above all, has nothing to do while the model is right, and nothing
-to unwind afterwards, which is what overshoot of a well-damped loop comes from.
+reference r.  The wheel then follows r, and the measurement lags behind it by the delay and the
+averaging of the loop.  The error is taken from the reference delayed by this lag.  While the model
+is right the integral stays unchanged, and nothing has to unwind afterwards, which is the cause of
+overshoot in a well-damped loop.
 
 References
 ----------
@@ -33,22 +33,22 @@ from smp_motor_ident.tune.problem import check_target, compute_measured_lag
 from smp_motor_ident.tune.simulation import Controller, Inputs, simulate, step_figures
 
 STEADY_VOLTAGE_SHARE = 0.92
-"""Share of the supply that a constant speed may use; the rest is left to the feedback."""
+"""Share of the supply for a constant speed; the rest is left to the feedback."""
 
-PEAK_VOLTAGE_SHARE = 0.95  # share of the supply that a planned change of speed may use at its peak
+PEAK_VOLTAGE_SHARE = 0.95  # share of the supply for the peak of a planned change of speed
 
-STEP_SHARE = 0.5  # share of the largest speed that the figures of a design are about
+STEP_SHARE = 0.5  # change of set-point of the figures of a design, as a share of the top speed
 
 
 @dataclass(frozen=True)
 class Reference:
-    """How a change of set-point is asked of a motor; at the motor shaft."""
+    """Limits and duration of planned changes of set-point, at the motor shaft."""
 
     max_velocity: float  # [rad/s]
     max_acceleration: float  # [rad/s^2]; infinite where voltage alone limits
     # Duration of every minimum-jerk change [s]; larger ones are made as fast as limits allow
     transition_time: float
-    lag: float  # of the measured speed behind the reference [s]
+    lag: float  # lag of the measured speed behind the reference [s]
     doubt: float  # error of that lag which the feedback ignores [s]
     drive: Drive  # motor and voltage limit for large changes
 
@@ -132,10 +132,10 @@ def plan_reference(
     drive: float = math.inf,
     slew: float = math.inf,
 ) -> Reference:
-    """Return the fastest reference, of ``least`` seconds, that is followed without overshoot.
+    """Return the fastest reference, of ``least`` seconds at least, that causes no overshoot.
 
-    It leads the first of ``plants``, and the others follow it, too, with no more than a voltage
-    ``drive`` beyond their back-EMF and friction, which changes by no more than ``slew`` [V/s].
+    It is planned for the first of ``plants`` and holds for the others.  The voltage beyond back-EMF
+    and friction is at most ``drive``, its rate at most ``slew`` [V/s].
     """
     plant = plants[0]
     ratio = loop.gear_ratio
@@ -200,10 +200,9 @@ def _limit_velocity(plant: Plant, loop: Loop, wished: float | None) -> float:
 def _find_shortest(
     plants: Sequence[Plant], loop: Loop, controller: Controller, plan: Reference, least: float
 ) -> Reference:
-    """Return the plan with the shortest change of speed, however small, that does not overshoot.
+    """Return the plan with the shortest transition that hardly overshoots.
 
-    By more than one percent when the loop's delay is as usual, or one and a half when it is longer
-    by the loop's doubt, or the motor another one than is taken.
+    The limit is 1 % with the usual delay, and 1.5 % with the doubted delay or with another motor.
     """
     late = replace(loop, delay=loop.expected_delay + loop.delay_doubt)
     first, *others = plants
@@ -226,7 +225,7 @@ def _find_shortest(
 
 
 def _measure_overshoot(led: Plant, plant: Plant, controller: Controller, plan: Reference) -> float:
-    """Return the overshoot of a small change [%], which is planned for a motor that it leads."""
+    """Return the overshoot of a small change [%] that is planned for the plant ``led``."""
     slow, T = plan.drive.time_constant, plant.sample_time
     time = T * np.arange(
         int((plan.transition_time + plan.lag + 3 * slow) / T) + 2, dtype=np.float64
@@ -238,9 +237,9 @@ def _measure_overshoot(led: Plant, plant: Plant, controller: Controller, plan: R
 
 
 def _limit_acceleration(plan: Reference, slew: float) -> float:
-    """Return the largest acceleration that no change of speed takes beyond the voltage.
+    """Return the largest acceleration that keeps the voltage and its rate within their limits.
 
-    Nor beyond how fast that changes, as the speed [rad/s^2] that it would hold for ever.
+    ``slew`` is the limit of the rate, divided by the volts per speed [rad/s^2].
     """
     quickest, drive, rest = plan.transition_time, plan.drive, minimum_jerk.Reference(0.0, 0.0, 0.0)
     highest = PEAK_ACCELERATION * plan.max_velocity / quickest

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Step and load responses of the loop, of a batch of motors at once.
+"""Simulate step and load responses of the loop, for a batch of motors at once.
 
 The running PID (saturation, anti-windup, set-point weights, feed-forward) on the sampled
-motor, everything at the motor shaft.  Coulomb friction acts as the voltage that it takes, with a
-sign that it keeps for a sample, and holds a motor at rest that is given less.
+motor, all at the motor shaft.  Coulomb friction is a voltage whose sign is kept for a sample; it
+holds a motor at rest under a smaller voltage.
 """
 
 import math
@@ -41,7 +41,7 @@ class Response:
 
     speed: Array  # shape (n, k), [rad/s]: true speed of the motor
     voltage: Array  # shape (n, k), [V]: output of the controller
-    # shape (n,): whether the counts contradicted the observer, which the running loop replaces then
+    # shape (n,): whether the counts contradicted the observer, which the running loop then replaces
     contradicted: NDArray[np.bool_]
 
 
@@ -49,8 +49,7 @@ class Response:
 class Inputs:
     """Inputs of the loop at the sampling instants, each of shape (k,)."""
 
-    # low, high: [rad/s]: between which the measurement is left alone; one reference where there is
-    # no ``high``
+    # low, high: [rad/s]: without error between them; without ``high``, ``low`` is the reference
     low: Array
     high: Array | None = None
     forward: Array | None = None  # [V]: Feed-forward
@@ -138,7 +137,7 @@ def _round_speed(speed: float, step: float) -> float:
 
 @compiled
 def _compute_drag(speed: float, friction: float, past: Array, reach: Array, load: float) -> float:
-    """Return the voltage of dry friction over a sample [V]; at rest it cancels what pushes."""
+    """Return the voltage of dry friction over a sample [V]; at rest it balances the drive."""
     if speed != 0.0 or friction == 0.0:
         return float(friction * np.sign(speed))
     pushed = 0.0
@@ -260,9 +259,9 @@ class StepFigures:
 
 
 def find_last_exit(time: Array, outside: NDArray[np.bool_]) -> Array:
-    """Return when signals, shape (..., k), are outside of their band no more.
+    """Return the time from which signals, shape (..., k), stay inside their band.
 
-    NaN where one is at the end.
+    NaN for signals that end outside.
     """
     inside = np.argmax(outside[..., ::-1], axis=-1)
     begin = np.where(outside.any(axis=-1), time.size - inside, 0)

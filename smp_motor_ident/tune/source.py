@@ -2,8 +2,8 @@
 """Choose the source of the speed: the hardware, differenced counts, or the observer.
 
 A difference over more samples has less noise and more lag; the observer has little of both while
-its model is right.  Gains are designed for each, and those that reject a load best within the same
-margins and the same control noise win, provided that every sampled motor settles.
+its model is right.  Gains are designed for each source within the same margins and control noise.
+The source with the best load rejection is chosen, provided that every drawn motor settles.
 """
 
 from collections.abc import Sequence
@@ -19,18 +19,18 @@ from smp_motor_ident.tune.feedback import Feedback
 from smp_motor_ident.tune.loop import Loop
 
 WINDOWS = (2, 4, 8, 16)
-"""Samples to difference over that are tried in addition to the reported speed."""
+"""Tried windows of the difference [samples]."""
 
 WINDOW_BENEFIT, OBSERVER_BENEFIT = 1.15, 1.5
-"""How many times better a load must be rejected for a longer window, and for the observer, which
-leans on the model, to be taken."""
+"""Required ratio of integral gains for a longer window, and for the observer, which depends on the
+model."""
 
 DRAWS = 200
 
 
 @dataclass(frozen=True)
 class Trial:
-    """Gains that one source allows."""
+    """Gains of one source of the speed."""
 
     loop: Loop  # with the source
     case: Case  # the motor in that loop
@@ -47,7 +47,7 @@ class Trial:
         return self.case.problem.control_noise(self.solved[0])
 
     def settles(self) -> bool:
-        """Tell whether a largest settling time can be stated."""
+        """Return whether a largest settling time can be stated."""
         try:
             return settles(self.case, self.solved[0])
         except DesignError:
@@ -68,7 +68,7 @@ def choose_source(estimate: Estimate, loop: Loop, **targets: Any) -> tuple[Loop,
     if loop.counts_per_revolution is None:
         words = "the reported speed: the encoder's counts are not known"
         return loop, words + _remark_on_averaging(estimate, loop, usual, targets)
-    # Of a speed that was recorded no window is known; of counts one sample is the shortest.
+    # The window of a recorded speed is unknown; the shortest one of counts is one sample.
     counted = replace(
         loop, speed_source="difference", difference_window=max(loop.difference_window, 1)
     )
@@ -108,7 +108,7 @@ def _select_trial(*trials: Trial | None) -> tuple[Trial | None, Sequence[Trial]]
 def _try_windows(
     estimate: Estimate, loop: Loop, usual: Trial | None, targets: dict[str, Any]
 ) -> Trial | None:
-    """Return the best of the longer windows, where the control noise is what holds gains back."""
+    """Return the best of the longer windows if the control noise limits the gains; else None."""
     if usual is not None and usual.control_noise <= 0.9 * loop.noise_limit:
         return None
     windows = [
@@ -142,7 +142,7 @@ def _remark_on_averaging(
 
 
 def _try_source(estimate: Estimate, loop: Loop, targets: dict[str, Any]) -> Trial | None:
-    # The control noise that the loop allows is a limit here: nothing is gained by noise.
+    # The allowed control noise is a strict limit here, so that no source gains by noise.
     strict = replace(loop, noise_voltage=loop.noise_limit)
     try:
         case = prepare(estimate, strict, "margin", {**targets, "samples": DRAWS})

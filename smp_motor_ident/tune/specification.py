@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How a design performs in simulation: figures of the nominal loop, and bands over the ensemble."""
+"""Simulate a design: figures of the nominal loop, and bands over the ensemble."""
 
 import math
 from collections.abc import Sequence
@@ -52,7 +52,7 @@ class Performance:
 
 @dataclass(frozen=True)
 class Band:
-    """A figure of the nominal loop, and the range of 99 % of the motors that may be."""
+    """A figure of the nominal loop, and its range over 99 % of the uncertain motors."""
 
     # value, low, high: NaN if undefined, such as the settling time of a loop that does not settle
     value: float
@@ -64,9 +64,8 @@ class Band:
 class Specification:
     """Bands of the answer to a change of set-point from rest, and of the margins.
 
-    Simulated with counts, dry friction and the usual delay, over draws of all that the estimate
-    leaves open, plus the effect of resonances that the recording does not exclude; the margins bear
-    the longest delay.
+    Simulated with counts, dry friction and the usual delay, over the uncertain motors, plus the
+    effect of resonances that the recording does not exclude.  Margins are for the longest delay.
     """
 
     samples: int  # motors that the bands are over; 0 where the estimate has no uncertainty
@@ -104,17 +103,17 @@ class Settling:
 
 
 DRAWS = 300
-"""Motors that the bands of a specification are over, fewer where a change takes many samples."""
+"""Largest number of motors behind the bands; fewer if a change takes many samples."""
 
 WORK, MIN_DRAWS = 1e6, 100
-"""Samples that are simulated for a specification, and least motors."""
+"""Largest number of simulated samples, and smallest number of motors."""
 
 
 def compute_figures(
     case: Case, usual: Plant, controller: Controller, reference: Reference,
     kept: tuple[Margins, BatchMargins], control_noise: float,
 ) -> tuple[Performance, Specification]:  # fmt: skip
-    """Simulate a design with the margins ``kept``: the nominal motor, and those that may be."""
+    """Simulate a design with the margins ``kept``: the nominal and the uncertain motors."""
     problem, (margins, found) = case.problem, kept
     loop = replace(problem.loop, delay=problem.loop.expected_delay)
     change = STEP_SHARE * reference.max_velocity
@@ -133,7 +132,7 @@ def compute_figures(
         overshoot=band(figures.overshoot, [one.overshoot for one in each], 100 * more),
         settling=band(figures.settling, [one.settling for one in each], longer),
         phase_margin=band(margins.phase, found.phase),
-        # No larger at its low end than a record can vouch for
+        # The low end is at most what a record can show
         gain_margin=replace(gain, low=min(gain.low, MAX_STATED_GAIN_MARGIN)),
         sensitivity=band(margins.sensitivity, found.sensitivity),
     )
@@ -142,7 +141,7 @@ def compute_figures(
 def _simulate_ensemble(
     case: Case, controller: Controller, loop: Loop, plan: Change, change: float, time: Array
 ) -> list[StepFigures]:
-    """Simulate a change with every motor that may be, with counts, noise, friction and driver."""
+    """Simulate a change of every uncertain motor, with counts, noise, friction and driver."""
     nominal = case.problem.plant.motors
     drawn = case.ensemble.plant.motors.first(max(int(min(DRAWS, WORK / time.size)), MIN_DRAWS))
     motors = drawn if case.drawn else nominal
@@ -185,8 +184,8 @@ def _simulate_ensemble(
 def _mark_counted(plant: Plant, nominal: Plant) -> NDArray[np.bool_]:
     """Tell for each motor whether the running loop's speed is made from counts.
 
-    A filter's is not, nor that of an alternative with a window so much shorter than the nominal
-    one's: what counts make of it would have been seen.
+    A filtered speed is not, nor that of an alternative with a much shorter window than the nominal
+    one, whose quantisation the recording would show.
     """
     shortest = 0.5 * nominal.window_length[0]
     made = (shortest > 0) & (plant.window_length >= shortest) & (plant.motors.sensor_lag == 0)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-r"""Unmodelled dynamics as a bound over frequency that the loop must bear.
+r"""Bound the unmodelled dynamics over frequency, for a robust loop.
 
 A motor whose response is ``G (1 + D)`` with ``|D(j w)| <= W(j w)`` keeps a loop stable that is
 stable with ``G``, if
@@ -50,10 +50,10 @@ from smp_motor_ident.tune.simulation import find_last_exit, settling_time
 FREQUENCY_COUNT = 40  # number of resonance frequencies, from the lowest of the bound up to Nyquist
 
 DAMPINGS = np.geomspace(RESONANCE_DAMPING, MAX_RESONANCE_DAMPING, 4)
-"""Of resonances, evenly spread over those of shafts."""
+"""Damping ratios of resonances, spread over those of shafts."""
 
 MIN_SAMPLES, MAX_SAMPLES = 2**13, 2**16
-"""Samples over which a resonance is followed; feedback may reduce its damping."""
+"""Simulated samples of a resonance, whose damping the feedback may reduce."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,7 +71,7 @@ class UnmodelledDynamics:
 
     @property
     def known(self) -> float:
-        """Frequency up to which the response is known to less than itself [rad/s]."""
+        """Frequency up to which the bound of the relative error is below 1 [rad/s]."""
         beyond = np.flatnonzero(self.bound >= 1)
         return float(self.frequency[beyond[0] if beyond.size else -1])
 
@@ -138,7 +138,7 @@ def _largest_errors(
 ) -> list[Complex]:
     """Return the errors of the largest resonances, shape (frequency, omega), for each damping.
 
-    They are the same for all gains of a wheel, so that those of the last wheels are kept.
+    They do not depend on the gains of a wheel, so the last ones are kept.
     """
     unmodelled = UnmodelledDynamics(np.frombuffer(frequency), np.frombuffer(bound))
     nyquist = math.pi / sample_time

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A drive on new gains against the design's bands, for every change of set-point.
+"""Compare a drive on new gains with the bands of the design, change by change.
 
-The prediction is the running loop itself on simulated motors: the nominal one and draws of all
-that the estimate leaves open, seen through the same encoder and read in the same way.
+The prediction is the running loop on simulated motors, the nominal one and uncertain ones, with
+the same encoder and the same evaluation.
 """
 
 import math
@@ -35,9 +35,9 @@ from smp_motor_ident.result import Estimate
 from smp_motor_ident.tune.motors import draw_motors, make_motors
 from smp_motor_ident.tune.simulation import settling_time
 
-SMOOTHING_S = 0.05  # length [s] of the parabola whose slope is taken as the speed
+SMOOTHING_S = 0.05  # length [s] of the fitted parabola whose slope is the speed
 
-STEADY_TIME_S = 0.3  # end of a change that is taken as steady [s]
+STEADY_TIME_S = 0.3  # steady end of a change [s]
 
 DRAWS = 12  # motors in addition to the nominal one
 
@@ -50,12 +50,12 @@ _WHEEL_ADVICE = (
     "motor that changed since; then commission again"
 )
 
-RESOLUTION_SIGMAS = 3.0  # of the speed's resolution that a reading may be off
+RESOLUTION_SIGMAS = 3.0  # allowed error of a reading, in standard deviations of the resolution
 
 
 @dataclass(frozen=True)
 class Reading:
-    """One change of set-point: as its record shows it, or as it may be at most by its design."""
+    """Figures of one change of set-point: measured, or the largest allowed by the design."""
 
     settling: float  # until it stays within a tolerance [s]; infinite where it does not
     overshoot: float  # beyond the set-point [% of the change]
@@ -66,7 +66,7 @@ class Reading:
 class Change:
     """One change of set-point of one wheel: its predicted and its recorded response."""
 
-    wheel: str  # whose
+    wheel: str
     name: str  # of the change in the drive
     setpoint: float  # [rad/s, wheel]
     time: Array  # since the change [s]
@@ -115,10 +115,10 @@ def read(time: Array, speed: Array, setpoint: float, tolerance: float) -> Readin
 def measure_arrival_delays(
     answers: tuple[Array, Array, Array], applied: tuple[Array, Array], loop: Mapping[str, Any]
 ) -> Array:
-    """Return how long each answer took from its sample until the motor had it.
+    """Return the time from each sample until the motor received the answer.
 
-    A computer that is busy keeps commands in queues, which their ages do not show; the voltages
-    that the driver reports do.  ``answers`` are times of the answered samples [s], how old these
+    Commands that wait in the queues of a busy computer act late, which only the voltages that the
+    driver reports show.  ``answers`` are times of the answered samples [s], how old these
     were when answered [s] and commands [V], each of shape (m,); ``applied`` times of the samples
     [s] and mean voltages over the intervals that end there [V], each of shape (n,).  Where the
     voltages are not the commands' (measured ones, say, or none inside a driver's dead zone) it is
@@ -166,7 +166,7 @@ def predict_speed(
     settings = loop_settings(parameters)
     rows = []
     for k, entry in enumerate(_draw_entries(estimate, float(loop["supply_voltage"]))):
-        phase = k / (1 + DRAWS)  # of a count; which it was nobody knows
+        phase = k / (1 + DRAWS)  # unknown fraction of a count at the start
         angle = _simulate_loop(entry, settings, setpoints, instants, delays, phase)
         even, speed = smooth_speed(instants, angle, step)
         rows.append(np.interp(time, even, speed))
@@ -255,7 +255,7 @@ def _read_limit(specification: Mapping[str, Any], name: str) -> float:
 
 
 def judge(changes: Sequence[Change]) -> list[Finding]:
-    """Hold what happened against the bands."""
+    """Return findings on readings beyond their bands."""
     found = []
     for one in changes:
         for name, unit, words in (

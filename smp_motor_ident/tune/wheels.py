@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One robot's wheels together: gains each or for all, and one reference for all of them."""
+"""Design all wheels of a robot: gains for each or for all, and one common reference."""
 
 import math
 from collections.abc import Mapping
@@ -26,11 +26,11 @@ MAX_REJECTION_LOSS = 1.1
 
 @dataclass(frozen=True)
 class WheelSet:
-    """Designs of all wheels, made to move together."""
+    """Designs of all wheels."""
 
-    # By wheel; every one has the same duration and limits of its reference
+    # By wheel; together they have one duration and one set of limits
     designs: Mapping[str, Design]
-    reason: str  # why one or each, and which motor sets the pace
+    reason: str  # why gains for one or all, and which motor limits the reference
 
 
 def design_wheels(
@@ -58,7 +58,7 @@ def design_wheels(
 
 
 def _finish_shared(case: Case, shared: Feedback) -> Design:
-    """Finish a design with gains that are per wheel rad/s."""
+    """Finish a design with common gains, per rad/s of the wheel."""
     mine = shared.scaled(1 / case.problem.loop.gear_ratio)
     return finish(case, mine, 1.0, case.ensemble.assess(mine))
 
@@ -66,7 +66,7 @@ def _finish_shared(case: Case, shared: Feedback) -> Design:
 def _plan_together(
     cases: Mapping[str, Case], own: Mapping[str, Design]
 ) -> tuple[dict[str, Design], str]:
-    """Give all wheels the one reference that the weakest of them can follow."""
+    """Return the designs with the one reference that all wheels can follow, and the reason."""
 
     each = {wheel: one.wheel_reference for wheel, one in own.items()}
     late = max(each, key=lambda w: each[w].transition_time)
@@ -93,7 +93,7 @@ def _plan_together(
 
 
 def common_drive(designs: Mapping[str, Design]) -> Drive:
-    """Return the motor whose fastest changes are within what every one of these can do."""
+    """Return a motor whose fastest changes every one of these can follow."""
     references = [one.wheel_reference for one in designs.values()]
     drives = [one.drive for one in references]
     step = max(one.loop.sample_time for one in designs.values())
@@ -122,12 +122,12 @@ def common_drive(designs: Mapping[str, Design]) -> Drive:
 def _choose_sets(
     cases: Mapping[str, Case], own: Mapping[str, Design], sets: Sets
 ) -> tuple[Feedback | None, str]:
-    """Return the feedback for all, per wheel rad/s, or None, and why."""
+    """Return common gains per rad/s of the wheel, or None, and the reason."""
     if sets == "each" or len(own) == 1:
         return None, "one set of gains each"
 
     def on_worst_wheel(gains: Feedback) -> Robustness:
-        """Return what gains, per wheel rad/s, do on the wheel where they hold least."""
+        """Return the robustness of gains on the wheel with the fewest motors that keep it."""
         found = [
             case.ensemble.assess(gains.scaled(1 / case.problem.loop.gear_ratio))
             for case in cases.values()

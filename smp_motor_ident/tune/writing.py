@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Designs as files: the parameter file of the wheel nodes, and ``gains.json``."""
+"""Write designs: the parameter file of the wheel nodes, and ``gains.json``."""
 
 import bisect
 import dataclasses
@@ -24,7 +24,7 @@ from smp_motor_ident.tune.loop import Loop
 SCHEMA = 1
 
 STOP_TIME_FACTOR = 1.25
-"""Safety factor on the computed time in which a reference stops from full speed."""
+"""Safety factor on the computed time of a stop from full speed."""
 
 
 def parameters(design: Design) -> dict[str, Any]:
@@ -45,7 +45,7 @@ def parameters(design: Design) -> dict[str, Any]:
         "difference_window": _choose_window(design),
         "model": {name: float(value) for name, value in design.motor.items()},
         **_widen_plausibility(reference.drive.top_speed, design.loop),
-        # From where a wheel that stands is at fault, if the usual voltage is too low
+        # Voltage above which a standing wheel is a fault, if the default is too low
         **({"stall_voltage": start} if start > FaultLimits().stall_voltage else {}),
         **_extend_time_outs(design),
     }
@@ -89,9 +89,8 @@ def describe_slow_loop(design: Design) -> list[str]:
 def _choose_window(design: Design) -> int:
     """Return the samples to difference counts over.
 
-    An observer that its counts contradict is replaced by their difference, over as many samples as
-    make a count no more than the control noise that the loop allows, with the gains that take
-    their place.
+    Differenced counts replace an observer that contradicts them.  The window is the shortest in
+    which one count causes at most the allowed control noise, with the gains for that window.
     """
     loop, motor = design.loop, MotorModel(**design.motor)
     if loop.speed_source != "observer" or loop.averaging_given:
@@ -107,10 +106,7 @@ def _choose_window(design: Design) -> int:
 
 
 def _widen_plausibility(top_speed: float, loop: Loop) -> dict[str, float]:
-    """Return the limits of plausible feedback where they are not those by default.
-
-    A wheel may be faster; the noise of a speed that was recorded is known.
-    """
+    """Return the limits of plausible feedback that differ from the defaults."""
     limits, usual = {}, WheelSettings().implausible_velocity
     if 2 * top_speed > usual:
         limits["implausible_velocity"] = 2 * top_speed

@@ -175,7 +175,7 @@ def _strip_brackets(line: str) -> str:
 
 
 def _strip_labels(line: str) -> str:
-    """Return the numbers of a row of labels."""
+    """Return a row without its labels and units."""
     return _UNIT.sub("", _LABEL.sub("", line))
 
 

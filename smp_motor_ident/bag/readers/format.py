@@ -56,7 +56,7 @@ class Messages(Source):
         return [self._channels[key] for key in sorted(self._channels)]
 
     def declared(self) -> dict[str, int] | None:
-        """Return the number of messages by topic where the file itself tells it."""
+        """Return the number of messages by topic if the file states it."""
         return None
 
     @abstractmethod

@@ -33,7 +33,7 @@ _BRACKETS = re.compile(r"\s*[\[(]([^\])]*)[\])]\s*$")
 _EXAMINED_ROWS = 60  # rows examined to tell names from numbers
 _MAX_EXAMINED = 1000  # examined cells of a row; examined rows without a number
 _MAX_NAME_LENGTH = 200  # characters of a column's name
-_YEARS = range(1678, 2262)  # that nanoseconds in 64 bits can tell
+_YEARS = range(1678, 2262)  # range of nanoseconds in 64 bits
 
 
 @dataclass

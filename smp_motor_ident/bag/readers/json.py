@@ -168,8 +168,8 @@ def _read_sysid(
     """Return the joined columns of all tests, their units, the wheel's radius and findings.
 
     With ``unitsPerRotation`` the rows are in rotations (in SysId always, in its forerunner since
-    April 2020), which that number converts to ``units``; otherwise they are in ``units``.  It is
-    not believed where it contradicts a unit of angle.
+    April 2020), and that number converts them to ``units``; otherwise they are in ``units``.  A
+    number that contradicts a unit of angle is replaced.
     """
     every = chain.from_iterable(document.get(test) or [] for test in _TESTS)
     rows = [row for row in every if isinstance(row, list) and len(row) >= 4]

@@ -34,7 +34,7 @@ def export(
             f"largest speed {_describe_settling(one)}, overshoot {step.overshoot:.2g} %"
         )
         head.extend(f"  {words}" for words in wheels.designs[wheel].warnings)
-    # A backslash at its end would make the next line a comment, too
+    # A backslash at the end would extend the comment to the next line
     text = "".join(f"{mark} {printable(line).replace(chr(92), '/')}\n" for line in head)
     return text + target.render(wheels.designs, gains), checks
 

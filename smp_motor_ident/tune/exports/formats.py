@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The targets of exports: numbers in their own units, their arithmetic, and its sources."""
+"""Define the targets of exports: units, arithmetic, and sources of both."""
 
 import math
 from collections.abc import Mapping
@@ -182,7 +182,7 @@ def _convert_ros_arduino_bridge(design: Design) -> Gains:
     Ko = _find_divisor(integral, proportional, largest)
     Kp, Kd = max(round(integral * Ko), 1), round(proportional * Ko)
     kp, kd = Kp / Ko / scale, Kd / Ko / scale
-    # On the measurement the present error's share is proportional action, too.
+    # The share of the present error is proportional action on the measurement, too.
     feedback = Feedback(kd + kp, kp / T)
     weight = kp / (kd + kp)
     rest = Ko / Kp / (ticks(loop) * T)

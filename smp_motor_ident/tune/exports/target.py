@@ -19,7 +19,7 @@ from smp_motor_ident.tune.plant import Plant, sample
 from smp_motor_ident.tune.reference import STEP_SHARE
 from smp_motor_ident.tune.simulation import Controller, Inputs, StepFigures, simulate, step_figures
 
-TARGETS = {"structure": "pi", "focus": "tracking"}  # of the designs that are exported
+TARGETS = {"structure": "pi", "focus": "tracking"}  # targets of exported designs
 
 
 @dataclass(frozen=True)
@@ -28,10 +28,10 @@ class Gains:
 
     numbers: Mapping[str, float]  # as the target takes them
     feedback: Feedback  # the same, as rounded, as the feedback of the running loop
-    weight: float = 1.0  # of the set-point in the proportional action [-]
-    # Time constant of anti-windup that comes nearest to the target's [s]
+    weight: float = 1.0  # set-point weight of the proportional action [-]
+    # Time constant of the anti-windup nearest to that of the target [s]
     tracking: float = math.inf
-    resting_error: float = 0.0  # below which whole numbers let an error be [rad/s, motor]
+    resting_error: float = 0.0  # largest error that integer arithmetic ignores [rad/s, motor]
 
 
 @dataclass(frozen=True)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Tuning methods, all behind one interface."""
+"""Provide the tuning methods under one interface."""
 
 from smp_motor_ident.tune.methods.margin import MARGIN
 from smp_motor_ident.tune.methods.rules import SIMC, TYREUS_LUYBEN, ZIEGLER_NICHOLS

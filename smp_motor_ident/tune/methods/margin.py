@@ -27,8 +27,8 @@ from smp_motor_ident.tune.unmodelled import describe_known_band
 
 FOCUS = ("balanced", "tracking", "load")
 MAX_NOISE_RAISES, CONTROL_NOISE_TARGET, SPEED_NOISE_TARGET = 8, 1.2, 1.0
-"""Largest number of raises of a default noise limit, each by a fifth, and the integral gain
-relative to SIMC's at which they end: for noise in the control, and for noise in the speed."""
+"""Largest number of raises of a noise limit, each by a fifth; ratio of the integral gain to that of
+SIMC at which they end, for the limits of control noise and of speed noise."""
 
 MAX_COMPLEMENTARY_PEAK = {"balanced": 1.25, "tracking": 1.05, "load": math.inf}
 """Largest peak of the complementary sensitivity, by focus."""
@@ -139,7 +139,7 @@ def _search(
 ) -> _Found | None:
     """Return the best feedback and its crossover, zooming in twice, or None."""
     omega = problem.omega
-    # Ms leaves at least this phase: less need not be looked for.
+    # Ms implies at least this phase margin.
     margin = max(margin, 0.95 * math.degrees(2 * math.asin(min(0.5 / peak, 1.0))))
     shares = np.zeros(1) if problem.structure == "pi" else _DERIVATIVE_SHARES
     if bandwidth is None:
@@ -209,7 +209,7 @@ def _candidates(problem: Problem, crossovers: Array, margins: Array, shares: Arr
 
 
 def _filter(problem: Problem, c: _Gains, margin: float, peak: float, hump: float) -> Array:
-    """Return which candidates keep margins, the hump of T, unmodelled dynamics, control noise."""
+    """Return which candidates keep the margins, the peak of T, robustness and noise limits."""
     omega, T = problem.omega, problem.loop.sample_time
     integral, derivative = terms(omega, T, c.filter_time[:, None])
     control = c.p[:, None] + c.i[:, None] * integral + c.d[:, None] * derivative

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Relay feedback: the ultimate point from a bounded oscillation, no model needed.
+"""Measure the ultimate point by relay feedback: a bounded oscillation, without a model.
 
 A relay in place of the controller makes the loop oscillate at a bounded voltage.  The
 fundamental of the recorded signals, ``|U1|^2 / |Y1 U1*|`` over every two cycles (P. Welch, The
@@ -37,7 +37,7 @@ def read_oscillation(
             f"the relay switched over only {lengths.size} steady cycles, it needs "
             f"{MIN_CYCLES}; run it longer or with a larger amplitude"
         )
-    # Skip cycles during which the computer paused, or the relay switched twice on counts.
+    # Skip cycles in which the computer paused or quantisation switched the relay twice.
     usual = float(np.median(lengths))
     alike = lengths[np.abs(lengths - usual) <= CYCLE_TOLERANCE * usual]
     power, cross = 0.0, 0j
@@ -50,7 +50,7 @@ def read_oscillation(
     if alike.size < MIN_CYCLES or power == 0:
         raise DesignError(
             f"only {alike.size} of {lengths.size} cycles are alike, it needs {MIN_CYCLES}: the "
-            "delay varies; run it on a machine that is less busy"
+            "delay varies; run it on a less busy machine"
         )
     if not abs(cross) > 0:
         raise DesignError("the wheel did not move under the relay; use a larger amplitude")

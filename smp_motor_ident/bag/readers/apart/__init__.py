@@ -13,7 +13,7 @@ from smp_motor_ident.errors import BagError
 
 PROGRAM = Path(__file__).parent / "program.py"
 TIMEOUT_S, TIMEOUT_PER_BYTE_S = 15.0, 1e-6
-"""Longest time to read a file [s], and addition per byte."""
+"""Longest time to read a file [s], and addition per byte of it."""
 
 
 def read(kind: str, path: Path, name: str, budget: Budget) -> tuple[dict[str, Any], io.BytesIO]:

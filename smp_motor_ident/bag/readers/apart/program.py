@@ -20,9 +20,7 @@ import numpy as np
 
 _HEADER_BYTES = 128  # bytes of a file of version 5 before its first variable
 _MAX_DEPTH = 16
-_MAX_MATRIX_COLUMNS = (
-    64  # columns of a matrix that are taken as signals; a wider one is something else
-)
+_MAX_MATRIX_COLUMNS = 64  # columns of a matrix of signals; a wider matrix holds something else
 _MAX_SHEET_ROWS = 1_048_576  # of a sheet, by Excel's own limits
 _MEMORY_LIMIT = resource.getrlimit(resource.RLIMIT_AS)[1]
 _READER_MEMORY = 1 << 26  # memory that readers need in addition to the file's contents [byte]
