@@ -5,18 +5,8 @@ from __future__ import annotations
 
 from typing import Any
 
-from smp_motor_control.errors import ParameterError, SmpError
-
-__all__ = [
-    "BagError",
-    "CurrentError",
-    "DesignError",
-    "InsufficientExcitationError",
-    "ParameterError",
-    "SignalError",
-    "SmpError",
-    "UnknownLagError",
-]
+from smp_motor_control.errors import ParameterError as ParameterError
+from smp_motor_control.errors import SmpError as SmpError
 
 
 class BagError(SmpError):

@@ -164,10 +164,15 @@ class Record:
 
     def slice(self, begin: int, end: int) -> Record:
         """Return the samples ``begin`` to ``end`` (exclusive) as a record that starts at time 0."""
+        part = self.take(np.arange(len(self))[begin:end])
+        return replace(part, time=part.time - part.time[0])
+
+    def take(self, rows: Integers) -> Record:
+        """Return the given rows in order; a new segment begins behind missing ones."""
+        starts = {0, *(np.flatnonzero(np.diff(rows) > 1) + 1), *np.searchsorted(rows, self.starts)}
+        names = ("time", "voltage", "current", "velocity", "position", "count")
         arrays: dict[str, Any] = {
-            name: None if (values := getattr(self, name)) is None else values[begin:end]
-            for name in ("voltage", "current", "velocity", "position", "count")
+            name: values[rows] for name in names if (values := getattr(self, name)) is not None
         }
-        starts = (0, *(s - begin for s in self.starts if begin < s < end))
-        time = self.time[begin:end] - self.time[begin]
-        return replace(self, time=time, starts=starts, **arrays)
+        starts_in_order = tuple(int(s) for s in sorted(starts) if s < rows.size)
+        return replace(self, starts=starts_in_order, **arrays)

@@ -29,7 +29,11 @@ from smp_motor_ident.bag.types import Types
 from smp_motor_ident.bag.units import find_unit, needs
 from smp_motor_ident.errors import BagError
 
-_RADIUS = "in metres, because the recording has the speed of the rim"
+_REASONS = {
+    "supply_voltage": "in volts",
+    "wheel_radius": "in metres, because the recording has the speed of the rim",
+    "pole_pairs": "of the motor, because erpm counts electrical revolutions",
+}
 _MAX_SAMPLES = 20_000  # examined samples
 _ROLES = ("voltage", *names.MOTIONS)
 _MAX_UNNAMED_COLUMNS = 16  # columns tried if their names are not conclusive
@@ -247,12 +251,9 @@ def _required_keys(
     if ":pwm" in units:
         largest = max(np.nanmax(np.abs(c.value)) for c in chosen if c.unit == ":pwm")
         asked["pwm_full_scale"] = f"the value that is 100 % (the largest here is {largest:g})"
-    if any(needs(c.role, c.unit[1:], "supply_voltage") for c in chosen):
-        asked["supply_voltage"] = "in volts"
-    if any(needs(c.role, c.unit[1:], "wheel_radius") for c in chosen):
-        asked["wheel_radius"] = _RADIUS
-    if any(needs(c.role, c.unit[1:], "pole_pairs") for c in chosen):
-        asked["pole_pairs"] = "of the motor, because erpm counts electrical revolutions"
+    for key, reason in _REASONS.items():
+        if any(needs(c.role, c.unit[1:], key) for c in chosen):
+            asked[key] = reason
     if any(c.role == "count" or c.unit.startswith(":ticks") for c in chosen):
         asked["counts_per_revolution"] = "of the motor shaft"
     speed = next((c for c in chosen if c.role == "velocity" and not c.unit), None)
@@ -290,7 +291,7 @@ def _read_own_mapping(recording: Recording) -> Proposal | None:
             source = f"{signal.topic}.{signal.field}" if signal.topic else signal.field
             items.append(f"{prefix}{name}={source}" + (f":{signal.unit}" if signal.unit else ""))
             rim |= needs(name, signal.unit, "wheel_radius")
-    asked = [f"wheel_radius=… {_RADIUS}"] if rim else []
+    asked = [f"wheel_radius=… {_REASONS['wheel_radius']}"] if rim else []
     alone = "wheel_radius alone is enough" if rim else "no mapping is needed"
     remark = f"the file says this itself: {alone}"
     return Proposal(suggestion=list(dict.fromkeys(items)), asked=asked, remark=remark)

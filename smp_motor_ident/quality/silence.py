@@ -43,9 +43,8 @@ def remove_silences(record: Record) -> Record:
     least = MIN_REMAINING_SHARE * len(record)
     while found := next((s for s in _find_silences(record) if s[2] + 1 < len(record)), None):
         name, a, b = found
-        rows = np.ones(len(record), dtype=np.bool_)
-        rows[a:b] = False
-        if rows.sum() < least:
+        rows = np.delete(np.arange(len(record)), np.s_[a:b])
+        if rows.size < least:
             break
         begin, end = record.time[a], record.time[b]
         finding = Finding(
@@ -56,21 +55,8 @@ def remove_silences(record: Record) -> Record:
             {"signal": name, "begin": float(begin), "end": float(end)},
             "look for a blocked motor, or for a loose cable of the encoder",
         )
-        record = replace(select_rows(record, rows), findings=(*record.findings, finding))
+        record = replace(record.take(rows), findings=(*record.findings, finding))
     return record
-
-
-def select_rows(record: Record, rows: Flags) -> Record:
-    """Select rows of a record; a new segment begins behind missing ones."""
-    at = np.flatnonzero(rows)
-    starts = {0, *(np.flatnonzero(np.diff(at) > 1) + 1), *np.searchsorted(at, record.starts)}
-    names = ("time", "voltage", "current", "velocity", "position", "count")
-    there = {n: v for n in names if (v := getattr(record, n)) is not None}
-    return replace(
-        record,
-        starts=tuple(int(s) for s in sorted(starts) if s < at.size),
-        **{n: v[at] for n, v in there.items()},
-    )
 
 
 def _find_silences(record: Record) -> Iterator[tuple[str, int, int]]:

@@ -9,12 +9,9 @@ from functools import partial
 from itertools import groupby
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
-from smp_motor_control.arrays import Array
 from smp_motor_ident.finding import SEVERITIES
 from smp_motor_ident.report import words
-from smp_motor_ident.report.drawing import Chart, Curve
+from smp_motor_ident.report.drawing import Chart, Curve, resample
 from smp_motor_ident.report.templates import page
 from smp_motor_ident.result import Estimate, Quantity
 
@@ -136,7 +133,7 @@ def charts(changes: Sequence[Change]) -> list[Chart]:
         time = max((one.time for one in mine), key=len)
         curves = []
         for one in mine:
-            on = partial(_resample, time, one.time)
+            on = partial(resample, time, one.time)
             curves += [
                 Curve(f"{one.name}, predicted", on(one.nominal), "simulated", "line",
                       on(one.low), on(one.high)),
@@ -154,11 +151,6 @@ def charts(changes: Sequence[Change]) -> list[Chart]:
             group="drive", summary=" ".join(told),
         ))  # fmt: skip
     return made
-
-
-def _resample(time: Array, own: Array, values: Array) -> Array:
-    """Return a curve at other instants, NaN after its end."""
-    return np.asarray(np.interp(time, own, values, right=np.nan))
 
 
 def render(

@@ -5,8 +5,8 @@ import math
 import os
 import shutil
 import tempfile
+import time
 from collections.abc import Iterable, Mapping
-from datetime import datetime, timezone
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -18,6 +18,7 @@ from smp_motor_control.errors import is_ros_name, printable
 from smp_motor_control.motor.parameters import COMBINATIONS, PHYSICAL
 from smp_motor_control.parameter_file import format_parameters
 from smp_motor_ident.errors import BagError, ParameterError
+from smp_motor_ident.report.words import date
 from smp_motor_ident.result import Estimate, Quantity
 
 SCHEMA = 1
@@ -29,7 +30,7 @@ POSITIVE_QUANTITIES = ("resistance", "inductance", "motor_constant", "inertia", 
 
 def now() -> str:
     """Return the present time as written in files."""
-    return datetime.now(timezone.utc).strftime("%Y-%m-%d %H:%M UTC")
+    return date(time.time())
 
 
 def identification_document(estimates: Mapping[str, Estimate]) -> dict[str, Any]:

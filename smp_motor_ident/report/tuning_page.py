@@ -11,10 +11,9 @@ from typing import Any
 
 import numpy as np
 
-from smp_motor_control.arrays import Array
 from smp_motor_ident.errors import SmpError
 from smp_motor_ident.report import drawing, words
-from smp_motor_ident.report.drawing import Chart, Curve
+from smp_motor_ident.report.drawing import Chart, Curve, resample
 from smp_motor_ident.result import Estimate
 from smp_motor_ident.tune import (
     METHODS,
@@ -227,7 +226,7 @@ def tuning_charts(wheels: Mapping[str, Curves], limit: float, prefix: str = "") 
         timed = kind in ("step", "load")
         x = time if timed else omega
         bands = {
-            wheel: _resample(x, c.time if timed else c.omega, getattr(c, kind))
+            wheel: resample(x, c.time if timed else c.omega, getattr(c, kind))
             for wheel, c in wheels.items()
         }
         curves = tuple(
@@ -235,7 +234,7 @@ def tuning_charts(wheels: Mapping[str, Curves], limit: float, prefix: str = "") 
             for k, (wheel, rows) in enumerate(bands.items())
         )
         if kind == "step":
-            curves += (Curve("reference", _resample(x, longest.time, longest.reference), "muted"),)
+            curves += (Curve("reference", resample(x, longest.time, longest.reference), "muted"),)
         return Chart(
             name=prefix + kind, title=title, y_label=y_label, log=log, lines=lines, curves=curves,
             x_label="time [ms]" if timed else "frequency [rad/s]",
@@ -251,12 +250,6 @@ def tuning_charts(wheels: Mapping[str, Curves], limit: float, prefix: str = "") 
         chart("sensitivity", f"Sensitivity (line: Ms {limit:g})", "|S|", "x", (limit,)),
         chart("noise", "Control noise", "density [V]", "xy"),
     ]
-
-
-def _resample(x: Array, own: Array, rows: Array) -> Array:
-    """Return curves on another axis, shape (..., x.size); NaN outside of their own."""
-    flatten = [np.interp(x, own, row, left=np.nan, right=np.nan) for row in np.atleast_2d(rows)]
-    return np.array(flatten).reshape(*rows.shape[:-1], x.size)
 
 
 def tuning_svg(wheels: Mapping[str, Curves], limit: float) -> str:

@@ -46,6 +46,7 @@ class Design:
     performance: Performance  # of the simulated loop
     specification: Specification  # bands over the distribution
     reference: Reference  # limits and duration of set-point changes, at the motor shaft
+    plant: Plant  # the sampled motor in its loop
     motor: dict[str, float]  # combinations that it was designed from, at the motor shaft
     sensor: dict[str, float]  # averaging and lag of the reported speed, as identified [s]
     wheel: str = ""  # whose gains these are
@@ -147,6 +148,7 @@ def finish(
         performance=figures,
         specification=bands,
         reference=reference,
+        plant=plant,
         motor={
             "dc_gain": 1 / float(m.a0[0]),
             "time_constant": float(m.a1[0] / m.a0[0]),

@@ -14,8 +14,6 @@ from smp_motor_ident.tune.feedback import Feedback
 from smp_motor_ident.tune.known_loop import KnownLoop
 from smp_motor_ident.tune.loop import Loop
 from smp_motor_ident.tune.margins import Margins, loop_margins
-from smp_motor_ident.tune.motors import Motors
-from smp_motor_ident.tune.plant import Plant, sample
 from smp_motor_ident.tune.reference import STEP_SHARE
 from smp_motor_ident.tune.simulation import Controller, Inputs, StepFigures, simulate, step_figures
 
@@ -66,18 +64,9 @@ class Check:
 MILLISECOND = 1e-3  # tolerance for whole milliseconds, since rates have six digits
 
 
-def sample_plant(design: Design) -> Plant:
-    """Return the sampled motor that a design is for, in its loop."""
-    a0 = 1 / design.motor["dc_gain"]
-    a1, a2 = a0 * design.motor["time_constant"], a0 * design.motor["time_constant_product"]
-    values = (a0, a1, a2, design.motor["delay"], design.motor["static_voltage"])
-    sensor = (design.sensor["averaging_window"], design.sensor["sensor_lag"])
-    return sample(Motors(*(np.array([x]) for x in (*values, *sensor))), design.loop)
-
-
 def check(design: Design, gains: Gains) -> Check:
     """Compute margins and step response of the loop that the target runs."""
-    loop, plant = design.loop, sample_plant(design)
+    loop, plant = design.loop, design.plant
     target = STEP_SHARE * design.reference.max_velocity
     steps = int(duration(design, gains) / loop.sample_time)
     time = loop.sample_time * np.arange(steps, dtype=np.float64)
