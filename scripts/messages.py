@@ -7,17 +7,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
-CALLS = {
-    "Finding",
-    "make_finding",
-    "add_finding",
-    "tell",
-    "_add_damage",
-    "warning",
-    "error",
-    "info",
-    "refuse",
-}
+CALLS = {"Finding", "note", "_damage", "report", "tell", "warning", "error", "info", "refuse"}
 STATES = {"State", "Fault"}
 """Enumerations whose values are messages."""
 TELLS = re.compile("_?(describe|report|problem|wrong|assess|name_cause)")

@@ -10,13 +10,7 @@ from numpy.typing import NDArray
 from smp_motor_control.arrays import Array, Integers
 from smp_motor_control.motor.parameters import Gearbox
 from smp_motor_ident.bag import checks, clock, counter, mapping, units
-from smp_motor_ident.bag.axis import (
-    Context,
-    Series,
-    resample_to_output,
-    select_finite,
-    unwrap_counts,
-)
+from smp_motor_ident.bag.axis import Context, Series, resample, select_finite, unwrap_counts
 from smp_motor_ident.bag.storage import Table
 from smp_motor_ident.errors import BagError
 from smp_motor_ident.limits import MAX_COUNT_STEP, MAX_STRAY_ROW_SHARE
@@ -65,7 +59,7 @@ def assemble(
     _check_series(motor, series)
     if together:
         _drop_incomplete_samples(motor, series, axis_name)
-    return resample_to_output(motor, series, axis_name)
+    return resample(motor, series, axis_name)
 
 
 def _describe_span(seconds: float) -> str:
@@ -224,9 +218,7 @@ def _times_across_resets(
     pauses = [max(int(log[begin] - log[begin - 1]), least) for begin, _ in parts[1:]]
     time = clock.concatenate_parts([stamp], [parts], pauses)[0]
     text = f"{topic}: the clock of the header stamps was set back {len(pauses)} times"
-    motor.report(
-        "clock_set_back", f"{text}; each begins a new segment", "warning", times=len(pauses)
-    )
+    motor.report("clock_set_back", f"{text}; a new segment at each", "warning", times=len(pauses))
     return {topic: time}
 
 

@@ -20,7 +20,7 @@ from smp_motor_ident.bag.counter import Unwrapped, angle_resets, report_resets, 
 from smp_motor_ident.bag.drives import find_late_rows, responds_in_its_row
 from smp_motor_ident.bag.mapping import MotorMap
 from smp_motor_ident.bag.names import MOTIONS
-from smp_motor_ident.bag.storage import Table, make_finding
+from smp_motor_ident.bag.storage import Table, note
 from smp_motor_ident.errors import BagError
 from smp_motor_ident.finding import Finding, Severity
 from smp_motor_ident.record import Hardware, Record
@@ -48,7 +48,7 @@ class Context:
 
     def report(self, code: str, text: str, severity: Severity = "note", **evidence: float) -> None:
         """Add a finding, once."""
-        finding = make_finding(code, text, severity, **evidence)
+        finding = note(code, text, severity, **evidence)
         if finding not in self.findings:
             self.findings.append(finding)
 
@@ -72,7 +72,7 @@ class Series:
         return Series(self.time[which], self.value[which], number, self.bits)
 
 
-def resample_to_output(motor: Context, series: dict[str, Series], axis_name: str) -> Record:
+def resample(motor: Context, series: dict[str, Series], axis_name: str) -> Record:
     """Make a record of signals with different sampling instants."""
     if "supply" in series:
         _multiply_duty_by_supply(series)

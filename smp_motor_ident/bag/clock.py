@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from smp_motor_control.arrays import Array, Integers
 from smp_motor_ident.bag.mapping import Signal
-from smp_motor_ident.bag.storage import Table, make_finding
+from smp_motor_ident.bag.storage import Table, note
 from smp_motor_ident.bag.units import UNITS
 from smp_motor_ident.errors import BagError
 from smp_motor_ident.limits import MIN_CLOCK_LEAP_S, MIN_RESTART_ROWS
@@ -21,7 +21,7 @@ Parts = list[tuple[int, int]]
 
 MISSING_TIME = -(2**62)  # time of a row without one
 
-_MIN_RUN_ROWS = round(MIN_RESTART_ROWS)
+_RUN_ROWS = round(MIN_RESTART_ROWS)
 _MIN_EARLIER_ROWS = 1000  # smallest number of earlier rows examined
 
 _SECOND_NS = 1_000_000_000
@@ -221,13 +221,13 @@ def _split_at_restarts(time: NDArray[Any], columns: Mapping[str, NDArray[Any]]) 
     if not moved.size:
         return [(0, time.size)]
     back = np.flatnonzero(np.diff(time) < -MIN_RESTART_ROWS * np.median(moved)) + 1
-    if back.size * 2 * _MIN_RUN_ROWS > time.size:  # shuffled, not restarted
+    if back.size * 2 * _RUN_ROWS > time.size:  # shuffled, not restarted
         return [(0, time.size)]
     # After a restart, unlike after one early or late row, most rows are earlier than those before
     falls = [
         k
         for k in back.tolist()
-        if np.median(time[k : k + _MIN_RUN_ROWS]) < np.median(time[max(0, k - _MIN_RUN_ROWS) : k])
+        if np.median(time[k : k + _RUN_ROWS]) < np.median(time[max(0, k - _RUN_ROWS) : k])
     ]
     edges, fell = [0], 0
     for k, end in pairwise([*falls, time.size]):
@@ -246,11 +246,7 @@ def _overlaps(
     inside = later[(later >= earlier[0]) & (later <= earlier[-1])]
     holes = np.unique(np.searchsorted(earlier, inside, "right"))
     # A late block fills one hole, each late row another one; the last run may be short.
-    least = (
-        _MIN_RUN_ROWS
-        if later.size > 2 * _MIN_RUN_ROWS
-        else max(1, min(_MIN_RUN_ROWS, inside.size - 1))
-    )
+    least = _RUN_ROWS if later.size > 2 * _RUN_ROWS else max(1, min(_RUN_ROWS, inside.size - 1))
     if holes.size <= least:
         return False
     _, first, second = np.intersect1d(time[old], later, return_indices=True)
@@ -319,9 +315,7 @@ def concatenate_runs(tables: Mapping[str, Table], gap: float, where: str) -> dic
     count = next(iter(numbers.values()))
     moved = concatenate_parts(times, list(every.values()), [pause] * count)
     text = f"{where}: the time starts again {count} times, as if runs were appended"
-    warning = make_finding(
-        "clock_set_back", f"{text}; each begins a new segment", "warning", times=count
-    )
+    warning = note("clock_set_back", f"{text}; a new segment at each", "warning", times=count)
     return {
         topic: replace(table, log=time, findings=[*table.findings, warning])
         for (topic, table), time in zip(tables.items(), moved)

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from smp_motor_control.arrays import Array, Integers
-from smp_motor_ident.bag.storage import make_finding
+from smp_motor_ident.bag.storage import note
 from smp_motor_ident.errors import BagError
 from smp_motor_ident.finding import Finding
 from smp_motor_ident.limits import (
@@ -127,11 +127,11 @@ def unwrap(count: Integers, bits: int | None, expected: Array | None = None) -> 
         if width & (width - 1):
             text = f"the encoder starts again at {width} counts; it was unwrapped"
             whole = np.rint(undo_wraps(count.astype(np.float64), width)).astype(np.int64)
-            findings.append(make_finding("counter_wraps", text, counts=width))
+            findings.append(note("counter_wraps", text, counts=width))
             return Unwrapped(whole, np.zeros(0, np.int64), findings)
         bits = width.bit_length() - 1
         text = f"the encoder wraps at 2^{bits} counts; it was unwrapped"
-        findings.append(make_finding("counter_wraps", text, bits=bits))
+        findings.append(note("counter_wraps", text, bits=bits))
     if bits:
         near = np.rint(guess).astype(np.int64)
         shift = np.int64(64 - bits)
@@ -153,8 +153,8 @@ def unwrap(count: Integers, bits: int | None, expected: Array | None = None) -> 
 
 def report_resets(what: str, times: int) -> Finding:
     """Report resets of a counter or an angle."""
-    text = f"the {what} was reset {times} times; each reset begins a new segment"
-    return make_finding("counter_reset", text, "warning", times=times)
+    text = f"the {what} was reset {times} times; a new segment at each"
+    return note("counter_reset", text, "warning", times=times)
 
 
 def _estimate_width(count: Integers, steps: Integers, guess: Array) -> int:

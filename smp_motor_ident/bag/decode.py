@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from smp_motor_control.arrays import Integers
 from smp_motor_ident.bag.source import Recording, find_recordings
-from smp_motor_ident.bag.storage import Batch, Channel, Table, gather, report_damage
+from smp_motor_ident.bag.storage import Batch, Channel, Table, gather, note_damage
 from smp_motor_ident.bag.template import (
     DecodeError,
     Number,
@@ -227,10 +227,10 @@ class _Collector:
             if decoder.undecodable:
                 text = f"{decoder.undecodable} messages are not of type {decoder.name}"
                 text += f" ({decoder.reason})"
-                table.findings.append(report_damage(f"{self.topic}: {text} and were left out"))
+                table.findings.append(note_damage(f"{self.topic}: {text} and were left out"))
         if self.packed:
             text = f"{self.topic}: {self.packed} messages could not be decompressed"
-            table.findings.append(report_damage(text))
+            table.findings.append(note_damage(text))
         return table
 
 

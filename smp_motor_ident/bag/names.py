@@ -11,7 +11,7 @@ WORDS_OF_VOLTS = (
     r"|gerilim|feszülts|напряж|电压|電圧|전압"
 )
 WORDS_OF_RADIANS = r"rad|omega|ω|(?:^|\W|_)w(?:$|\W|_)"
-ROLE_PATTERNS = {
+ROLES = {
     # Patterns of field and topic names, the most specific first.
     "direction": r"(?:^|\W|_)dir(?:ection)?(?:$|\W|_)|richtung|sentido|direcci",
     "voltage": WORDS_OF_VOLTS + r"|pwm|duty|throttle|entrada|eingang|^in$|(?:^|\W|_)power(?:$|\W|_)"
@@ -83,13 +83,11 @@ def split_words(name: str) -> str:
 def find_role(topic: str, path: str) -> str:
     """Return a field's role by its own name, else by its parent's, else by its topic's."""
     for text in (*reversed(re.sub(r"\[[^\]]*\]", "", path).split(".")), topic):
-        said = [
-            r for r, pattern in ROLE_PATTERNS.items() if re.search(pattern, split_words(text), re.I)
-        ]
-        if said[:1] == ["voltage"] and "velocity" in said and not names_voltage(text):
+        roles = [r for r, pattern in ROLES.items() if re.search(pattern, split_words(text), re.I)]
+        if roles[:1] == ["voltage"] and "velocity" in roles and not names_voltage(text):
             return ""  # a speed command
-        if said:
-            return said[0]
+        if roles:
+            return roles[0]
     return ""
 
 

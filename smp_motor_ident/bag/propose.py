@@ -100,7 +100,7 @@ def list_topics(paths: Any, msg_files: Iterable[str] = ()) -> list[Listing]:
                     read.read_recording(recording, _fill_placeholders(proposal), types)
                 except BagError as error:
                     text = f"a mapping was proposed by names and cannot be read: {error}"
-                    recording.findings.append(storage.make_finding("proposal_failed", text))
+                    recording.findings.append(storage.note("proposal_failed", text))
                     proposal = Proposal(remark="no mapping is suggested that can be read")
         listings.append(Listing(
             name=recording.name, topics=topics, needs_mapping=needed,

@@ -17,7 +17,7 @@ from smp_motor_ident.bag.decode import collect
 from smp_motor_ident.bag.mapping import MotorMap, Signal, SignalMap
 from smp_motor_ident.bag.names import is_speed_command
 from smp_motor_ident.bag.source import Recording, find_recordings
-from smp_motor_ident.bag.storage import Channel, Table, make_finding
+from smp_motor_ident.bag.storage import Channel, Table, note
 from smp_motor_ident.bag.tables import (
     add_time_columns,
     add_times,
@@ -58,9 +58,7 @@ def read_experiments(paths: Any, mapping: Any = None) -> dict[str, list[Record]]
     if failures and not read:
         raise failures[0]
     if failures:
-        missing = tuple(
-            make_finding("not_read", f"not read: {error}", "warning") for error in failures
-        )
+        missing = tuple(note("not_read", f"not read: {error}", "warning") for error in failures)
         read = {
             wheel: [replace(record, findings=(*record.findings, *missing)) for record in records]
             for wheel, records in read.items()
@@ -119,7 +117,7 @@ def join_records(records: list[Record]) -> Record:
         if any(part is None for part in parts):
             if name == "count":
                 text = "count: not in all recordings, left out"
-                findings.append(make_finding("count_left_out", text, "warning"))
+                findings.append(note("count_left_out", text, "warning"))
                 continue
             parts = [np.full(len(r), np.nan) if p is None else p for r, p in zip(records, parts)]
         columns[name] = np.concatenate(parts)
@@ -168,7 +166,7 @@ _DAMAGE = (
 def _assemble_records(recording: Recording, asked: SignalMap, types: Types) -> list[Record]:
     """Return the records of a bag or of tables."""
     channels = recording.channels()
-    plans = _plan_wheels(recording, asked, channels)
+    plans = _plan(recording, asked, channels)
     wanted: dict[str, list[str]] = {}
     signals = [signal for plan in plans.values() for signal in plan.signals.values()]
     for topic, name in dict.fromkeys((signal.topic, signal.field) for signal in signals):
@@ -199,14 +197,12 @@ def _assemble_records(recording: Recording, asked: SignalMap, types: Types) -> l
             del tables[topic]  # its memory is needed for the next
     if failures and not records:
         raise failures[0]
-    missing = [make_finding("not_read", f"not read: {error}", "warning") for error in failures]
+    missing = [note("not_read", f"not read: {error}", "warning") for error in failures]
     shared = (*recording.findings, *missing)
     return [replace(record, findings=(*shared, *record.findings)) for record in records]
 
 
-def _plan_wheels(
-    recording: Recording, asked: SignalMap, channels: list[Channel]
-) -> dict[str, MotorMap]:
+def _plan(recording: Recording, asked: SignalMap, channels: list[Channel]) -> dict[str, MotorMap]:
     """Return the signals of every wheel, mapped by the user or given by our own messages."""
     topics = {channel.topic for channel in channels}
     if any(motor.signals for motor in asked.motors.values()):
@@ -267,7 +263,7 @@ def _question_voltage(plan: MotorMap, channels: list[Channel]) -> list[Finding]:
         f"voltage: {name} is a speed command by its name; if a loop controls the speed, the "
         "estimates describe the loop, not the motor. Map the PWM or the voltage"
     )
-    return [make_finding("speed_command", text, "warning" if scaled else "unreliable")]
+    return [note("speed_command", text, "warning" if scaled else "unreliable")]
 
 
 def _find_description(
@@ -284,14 +280,14 @@ def _find_description(
             text = (
                 f"{topic}: {', '.join(changed)} changed while recording; the last values are used"
             )
-            return last, [make_finding("description_changed", text, "warning")] if changed else []
+            return last, [note("description_changed", text, "warning")] if changed else []
     if "gear_ratio" not in plan.hardware:
         own = any(signal.field == "encoder_count" for signal in plan.signals.values())
         text = (
             f"{wheel}: {'no motor_description' if own else 'no gear_ratio'}; a gear ratio of 1 "
             "is assumed, so the parameters refer to the measured shaft"
         )
-        return {}, [make_finding("gear_ratio_assumed", text)]
+        return {}, [note("gear_ratio_assumed", text)]
     return {}, []
 
 

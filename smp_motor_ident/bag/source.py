@@ -17,7 +17,7 @@ from smp_motor_control.errors import printable
 from smp_motor_control.parameter_file import load_bounded_yaml
 from smp_motor_ident.bag.readers import BAGS, PACKED, TABLES, is_table, open_source
 from smp_motor_ident.bag.readers.format import Messages, Tables, check_width
-from smp_motor_ident.bag.storage import TABLE, Batch, Channel, Table, make_finding, report_damage
+from smp_motor_ident.bag.storage import TABLE, Batch, Channel, Table, note, note_damage
 from smp_motor_ident.bag.unpack import Budget, make_temporary_folder
 from smp_motor_ident.errors import BagError
 from smp_motor_ident.finding import Finding
@@ -90,7 +90,7 @@ class Recording:
         for path in self.files:
             if (source := self._open(path)) is not None:
                 every += [replace(c, topic=self._name_topic(path, c)) for c in source.channels()]
-                self._add_findings(*source.problems)
+                self._add(*source.problems)
         check_width(len({c.topic for c in every}), self.name, "topics")
         check_width(sum(len(c.fields) for c in every), self.name)
         return every
@@ -124,7 +124,7 @@ class Recording:
                     yield batches
                 asked = {c.topic for c in source.channels() if wanted(c)}
                 seen |= asked
-                self._add_findings(*source.problems)
+                self._add(*source.problems)
                 for topic, count in (source.declared() or {}).items():
                     if topic in asked and mine[topic] < count:
                         self._report_loss(path.name, topic, mine[topic], count)
@@ -133,7 +133,7 @@ class Recording:
             if topic in seen and counts[topic] < count:
                 self._report_loss("metadata.yaml", topic, counts[topic], count)
 
-    def _add_findings(self, *findings: Finding) -> None:
+    def _add(self, *findings: Finding) -> None:
         self.findings += [f for f in findings if f not in self.findings]
 
     def _report_loss(self, who: str, topic: str, have: int, declared: int) -> None:
@@ -141,9 +141,7 @@ class Recording:
             f"{self.name}: {topic}: {have} of {declared} messages could be read "
             f"({who} counts {declared}; {declared - have} are lost)"
         )
-        self._add_findings(
-            make_finding("messages_lost", text, "warning", read=have, counted=declared)
-        )
+        self._add(note("messages_lost", text, "warning", read=have, counted=declared))
 
     def _open(self, path: Path) -> Messages | Tables | None:
         """Open a file; an unreadable one among several becomes a finding."""
@@ -159,7 +157,7 @@ class Recording:
                 if len(self.files) == 1 or self.is_table:
                     raise
                 self._sources[path] = None
-                self._add_findings(report_damage(str(error)))
+                self._add(note_damage(str(error)))
         return self._sources[path]
 
 
@@ -250,7 +248,7 @@ def _group_files(name: str, here: Sequence[Path]) -> list[Recording]:
     text = f"{name}: has no metadata.yaml; all its files are read"
     every = []
     for key, files in groups.items():
-        amiss = [] if files[0].suffix == ".bag" else [make_finding("no_metadata", text)]
+        amiss = [] if files[0].suffix == ".bag" else [note("no_metadata", text)]
         whole = name if len(groups) == 1 else f"{name}/{key}"
         every.append(Recording(whole, sorted(files, key=_sort_key), findings=amiss))
     tables = [s for s in TABLES if s not in _NAMED_ONLY]
@@ -292,7 +290,7 @@ def _read_bag_folder(path: Path) -> Recording:
     except (yaml.YAMLError, ValueError, OSError, ArithmeticError) as error:
         reason = " ".join(str(error).split())[:200] or type(error).__name__
         bag.findings.append(
-            report_damage(f"{name}: metadata.yaml is damaged ({reason}); all files are read")
+            note_damage(f"{name}: metadata.yaml is damaged ({reason}); all files are read")
         )
         bag.declared, listed = None, []
     there = _select_bag_files(sorted(path.iterdir()))
@@ -301,7 +299,7 @@ def _read_bag_folder(path: Path) -> Recording:
         match = next((path / o for o in options if o and (path / o).is_file()), None)
         if match is None:
             bag.findings.append(
-                report_damage(f"{name}: {file} is missing, which metadata.yaml lists")
+                note_damage(f"{name}: {file} is missing, which metadata.yaml lists")
             )
         elif match not in bag.files:
             bag.files.append(match)
@@ -311,7 +309,7 @@ def _read_bag_folder(path: Path) -> Recording:
     if extra and listed:
         names = ", ".join(file.name for file in extra)
         text = f"{name}: {names} is not listed in metadata.yaml and is read too"
-        bag.findings.append(make_finding("unlisted_files", text))
+        bag.findings.append(note("unlisted_files", text))
     bag.files += extra
     if not bag.files:
         reason = bag.findings[-1].message if bag.findings else "holds no .mcap or .db3"

@@ -17,14 +17,12 @@ Bytes = NDArray[np.uint8]
 TABLE = "table"  # encoding of a channel whose file holds columns of numbers instead of messages
 
 
-def make_finding(
-    code: str, message: str, severity: Severity = "note", **evidence: float
-) -> Finding:
+def note(code: str, message: str, severity: Severity = "note", **evidence: float) -> Finding:
     """Return a finding with its evidence."""
     return Finding(code, severity, message, evidence)
 
 
-def report_damage(message: str) -> Finding:
+def note_damage(message: str) -> Finding:
     """Return a finding on a lost part of a recording."""
     return Finding("damaged_recording", "warning", message)
 

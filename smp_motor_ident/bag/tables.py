@@ -16,7 +16,7 @@ from smp_motor_ident.bag.mapping import DEFAULT_MOTOR, MotorMap, Signal, SignalM
 from smp_motor_ident.bag.names import MOTIONS, separates_motors
 from smp_motor_ident.bag.readers.grid import strip_unit
 from smp_motor_ident.bag.source import Recording
-from smp_motor_ident.bag.storage import TABLE, Channel, Table, make_finding
+from smp_motor_ident.bag.storage import TABLE, Channel, Table, note
 from smp_motor_ident.errors import BagError
 from smp_motor_ident.finding import Finding
 
@@ -172,7 +172,7 @@ def separate_motors(
                 f"{recording.name}: {column} separates the rows of {len(own)} motors: "
                 f"{', '.join(own)}"
             )
-            finding = make_finding("several_motors", text, motors=len(own))
+            finding = note("several_motors", text, motors=len(own))
             motors = [_select_rows(tables[topic], of == n, finding) for n in numbers]
             before = "" if wheel == DEFAULT_MOTOR else f"{wheel}_"
             return [(before + n, {**tables, topic: rows}) for n, rows in zip(own, motors)]
@@ -221,12 +221,12 @@ def add_times(
                     _check_seconds(log, signal, recording)
                 if unit and unit != signal.unit:
                     text = f"{recording.name}: {signal.field} is read as {unit} since 1970"
-                    findings.append(make_finding("time_unit", text))
+                    findings.append(note("time_unit", text))
         sound = log > clock.MISSING_TIME
         columns = table.columns
         if not sound.all():
             text = f"{recording.name}: {int((~sound).sum())} rows without time were left out"
-            findings.append(make_finding("rows_without_time", text, "warning"))
+            findings.append(note("rows_without_time", text, "warning"))
             log, columns = log[sound], {name: c[sound] for name, c in columns.items()}
         if not log.size:
             raise BagError(

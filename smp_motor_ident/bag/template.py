@@ -16,12 +16,8 @@ from rosbags.interfaces import Nodetype
 from smp_motor_ident.bag.types import Definitions
 from smp_motor_ident.errors import BagError
 
-_NUMBER_TYPES = (
-    "float32",
-    "float64",
-    *(f"{u}int{bits}" for u in ("", "u") for bits in (8, 16, 32, 64)),
-)
-_KINDS = {name: np.dtype(name).str[1:] for name in _NUMBER_TYPES}
+_NUMBERS = ("float32", "float64", *(f"{u}int{n}" for u in ("", "u") for n in (8, 16, 32, 64)))
+_KINDS = {name: np.dtype(name).str[1:] for name in _NUMBERS}
 _KINDS |= dict.fromkeys(("bool", "byte", "char", "octet"), "u1")
 _MAX_ELEMENTS = 100_000  # messages inside one
 _STEP = re.compile(r"(\w+)((?:\[[^\]]*\])*)")

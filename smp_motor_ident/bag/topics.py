@@ -104,19 +104,17 @@ def _list_fields(types: Types, batch: Any) -> tuple[list[str], str]:
             except template.DecodeError as error:
                 reason = str(error)
                 continue
-            fields = (
-                _list_paths(name, value, root) for name, value in root.items() if name != "header"
-            )
+            fields = (_walk(name, value, root) for name, value in root.items() if name != "header")
             return list(chain.from_iterable(fields)), ""
     except BagError:
         return [], "unknown type: give its .msg files"
     return [], f"does not match its type: {reason}"
 
 
-def _list_paths(path: str, value: Any, parent: dict[str, Any]) -> Iterator[str]:
+def _walk(path: str, value: Any, parent: dict[str, Any]) -> Iterator[str]:
     if isinstance(value, dict):
         for name, inner in value.items():
-            yield from _list_paths(f"{path}.{name}", inner, value)
+            yield from _walk(f"{path}.{name}", inner, value)
     elif isinstance(value, template.Number) and value.count is None:
         yield path
     elif isinstance(value, template.Number) or (
@@ -130,4 +128,4 @@ def _list_paths(path: str, value: Any, parent: dict[str, Any]) -> Iterator[str]:
                 break
         for k, key in enumerate(keys):
             inner = value[k] if isinstance(value, list) else template.Number(0, "")
-            yield from _list_paths(f"{path}[{key}]", inner, parent)
+            yield from _walk(f"{path}[{key}]", inner, parent)

@@ -68,13 +68,11 @@ def _measure_bag(recording: source.Recording) -> dict[str, TransportDelay]:
             pairs[place.rpartition("/")[2]] = topic, f"{place}/motor_command"
     wanted = {topic: ["voltage"] for pair in pairs.values() for topic in pair}
     tables = decode.collect(recording, wanted, types.Types())
-    delays = {
-        w: _measure_wheel(tables[state], tables[command]) for w, (state, command) in pairs.items()
-    }
+    delays = {w: _measure(tables[state], tables[command]) for w, (state, command) in pairs.items()}
     return {wheel: delay for wheel, delay in delays.items() if delay is not None}
 
 
-def _measure_wheel(state: Table, command: Table) -> TransportDelay | None:
+def _measure(state: Table, command: Table) -> TransportDelay | None:
     if state.stamp is None or command.stamp is None or state.stamp.size < MIN_COMMANDS:
         return None
     answers = np.isin(command.stamp, state.stamp)
@@ -87,16 +85,14 @@ def _measure_wheel(state: Table, command: Table) -> TransportDelay | None:
     arrival = 1e-9 * (log - (stamp if one_clock else offset.to_log(stamp)))
     usual, longest = (float(q) for q in np.quantile(arrival, (0.5, DELAY_QUANTILE)))
     period = 1e-9 * float(np.median(np.diff(np.sort(state.stamp))))
-    applied = _fit_applied_delay(state, stamp, command.columns["voltage"][answers], period)
+    applied = _fit_delay(state, stamp, command.columns["voltage"][answers], period)
     latched = applied is not None and applied > usual + 0.25 * period
     if applied is not None and not latched:
         usual, longest = applied, max(longest, applied)
     return TransportDelay(max(usual, 0.0), max(longest, 0.0), latched, int(stamp.size))
 
 
-def _fit_applied_delay(
-    state: Table, stamp: Integers, voltage: Array, period: float
-) -> float | None:
+def _fit_delay(state: Table, stamp: Integers, voltage: Array, period: float) -> float | None:
     """Return the delay that explains the reported voltages, or None."""
     assert state.stamp is not None
     order = np.argsort(stamp, kind="stable")

@@ -74,11 +74,8 @@ def results(
             Row(name, unit, tuple(f"{one['gains'][name]:.4g}" for one in entries))
             for name, unit in GAINS
         ]
-        groups = {
-            "Drive": list(_list_drive_rows(entries, driven)),
-            "Gains of wheel_pid": held,
-            **groups,
-        }
+        drive = list(_list_drive_rows(entries, driven))
+        groups = {"Drive": drive, "Gains of wheel_pid": held, **groups}
     return groups
 
 
@@ -112,10 +109,7 @@ def _list_drive_rows(
             planned = (_format_figure(scale, e["settling"]["transition"]) for e in entries)
             yield Row("Duration of the planned change", unit, tuple(planned))
         if all(driven):
-            for key, of in (
-                ("allowed", "allowed in the drive"),
-                ("reading", "measured in the drive"),
-            ):
+            for key, of in (("allowed", "allowed in the drive"), ("reading", "measured")):
                 most = ([one[key][name] for one in changes] for changes in driven)
                 cells = (_format_figure(scale, None if None in m else max(m)) for m in most)
                 yield Row(f"{title}, {of}", unit, tuple(cells))

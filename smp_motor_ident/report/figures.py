@@ -13,9 +13,7 @@ from smp_motor_ident.report.words import label
 from smp_motor_ident.result import ResidualTests
 
 MAX_POINTS = 8000  # points of a curve over time: one a pixel when zoomed in tenfold
-VIEW_LAGS = (
-    80.0  # time constants that a screen shows at first, so that single responses are visible
-)
+VIEW_LAGS = 80.0  # time constants that a screen shows at first: single responses are visible
 MIN_COHERENCE = 0.6
 """Smallest coherence of a shown frequency; below it most of the spectrum is no response."""
 

@@ -38,9 +38,7 @@ class Report:
 
 def render(report: Report) -> str:
     """Return the page."""
-    motors = {
-        wheel: _describe_motor(estimate, report) for wheel, estimate in report.estimates.items()
-    }
+    motors = {wheel: _describe(estimate, report) for wheel, estimate in report.estimates.items()}
     tuning_charts, tuning_data = list[Chart](), dict[str, Any]()
     if report.tunings:
         from smp_motor_ident.report import tuning_page  # loads all of tune, which few reports need
@@ -61,7 +59,7 @@ def render(report: Report) -> str:
     )
 
 
-def _describe_motor(estimate: Estimate, report: Report) -> dict[str, Any]:
+def _describe(estimate: Estimate, report: Report) -> dict[str, Any]:
     """Return the template's data for one motor, in the order of a reader's questions."""
     wheel = estimate.wheel
     parts, since = report.comparisons.get(wheel, ()), report.history.get(wheel, ())
@@ -77,9 +75,7 @@ def _describe_motor(estimate: Estimate, report: Report) -> dict[str, Any]:
         "grade": grade,
         "verdict": verdict,
         "fit_percent": summary.describe_fit(estimate),
-        "rows": [
-            _describe_quantity(n, q, doubted.get(n)) for n, q in held.items() if words.is_stated(q)
-        ],
+        "rows": [_make_row(n, q, doubted.get(n)) for n, q in held.items() if words.is_stated(q)],
         "hidden": [words.label_in_sentence(n) for n, q in held.items() if not words.is_stated(q)],
         "messages": shown,
         "other": other,
@@ -113,7 +109,7 @@ def _describe_gains(estimate: Estimate, report: Report) -> tuple[str, str]:
     return f"Gains of wheel_pid, in volts and rad/s of the wheel: {gains}; parameter file:", ""
 
 
-def _describe_quantity(name: str, quantity: Quantity, doubt: int | None) -> dict[str, Any]:
+def _make_row(name: str, quantity: Quantity, doubt: int | None) -> dict[str, Any]:
     """Return one row of a table of quantities; ``doubt`` is the number of a message against it."""
     _, symbol, title, meaning = QUANTITIES.get(name, ("", "", words.label(name), ""))
     return dict(

@@ -71,15 +71,11 @@ def design_all_wheels(
         try:
             return design_wheels(left, loops).designs, refused
         except SmpError as error:
-            refused |= _explain_refusals(left, loops) or {
-                w: Tuning(w, reason=str(error)) for w in left
-            }
+            refused |= _refuse(left, loops) or {w: Tuning(w, reason=str(error)) for w in left}
     return {}, refused
 
 
-def _explain_refusals(
-    estimates: Mapping[str, Estimate], loops: Mapping[str, Loop]
-) -> dict[str, Tuning]:
+def _refuse(estimates: Mapping[str, Estimate], loops: Mapping[str, Loop]) -> dict[str, Tuning]:
     """Return the wheels for which there is no design at all, with the reason."""
     found = {}
     for wheel, estimate in estimates.items():

@@ -105,8 +105,8 @@ def _find_static_voltage(estimate: Estimate) -> Quantity | None:
 
 def make_motors(estimate: Estimate) -> Motors:
     """Return the motor of an estimate, from its combinations or else its parameters."""
-    return _convert_values(
-        estimate, {name: np.array([estimate.value(name)]) for name in _list_quantities(estimate)}
+    return _convert(
+        estimate, {name: np.array([estimate.value(name)]) for name in _list_names(estimate)}
     )
 
 
@@ -119,7 +119,7 @@ def draw_motors(
     at zero.  The spread of an unreliable estimate is at least its unexplained share.  A second lag
     without a stated value is uniform over its range.
     """
-    names = _list_quantities(estimate)
+    names = _list_names(estimate)
     mean = np.array([estimate.value(name) for name in names])
     covariance = _covariance(estimate, names, mean)
     wide = friction is not None and friction.high > friction.low
@@ -140,7 +140,7 @@ def draw_motors(
     }
     if hidden and "dc_gain" in names:
         values["time_constant_product"] = rng.uniform(*hidden, n)
-    motors = _convert_values(estimate, values)
+    motors = _convert(estimate, values)
     if friction is not None:
         static = np.clip(motors.static_voltage, friction.low, friction.high)
         if np.ptp(static) == 0.0 and wide:
@@ -240,7 +240,7 @@ def unreliable_spread(estimate: Estimate) -> float:
     return min(max(MIN_UNRELIABLE_STD, unexplained), 0.5)
 
 
-def _list_quantities(estimate: Estimate) -> tuple[str, ...]:
+def _list_names(estimate: Estimate) -> tuple[str, ...]:
     if estimate.value("dc_gain") and estimate.value("time_constant"):
         return (*COMBINATIONS, *SENSOR)
     if all(estimate.value(n) for n in ("resistance", "motor_constant", "inertia")):
@@ -254,7 +254,7 @@ def _list_quantities(estimate: Estimate) -> tuple[str, ...]:
     )
 
 
-def _convert_values(estimate: Estimate, value: dict[str, Array]) -> Motors:
+def _convert(estimate: Estimate, value: dict[str, Array]) -> Motors:
     if "dc_gain" in value:
         a0 = 1 / value["dc_gain"]
         a1 = value["time_constant"] * a0

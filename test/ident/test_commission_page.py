@@ -89,7 +89,7 @@ def test_page_opens_with_motors_and_gains_then_yaml_then_the_drive(passed, tmp_p
             "± 0.22 % (current low-pass)"
         ] * 4
         assert rows["Settles, designed ms"] == ["145, at most 150"] * 4
-        assert rows["Settles, measured in the drive ms"] == ["149"] * 4
+        assert rows["Settles, measured ms"] == ["149"] * 4
         # The button copies the parameter file.
         (copied,) = shown(browser, "#gains pre")
         assert yaml.safe_load(copied) == yaml.safe_load((passed / "gains.yaml").read_text())

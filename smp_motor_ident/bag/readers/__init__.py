@@ -5,7 +5,7 @@ from pathlib import Path
 
 from smp_motor_ident.bag.readers import csv, json, mat, mcap, ros1, sqlite, wpilog, xlsx
 from smp_motor_ident.bag.readers.format import Format, Messages, Tables
-from smp_motor_ident.bag.storage import report_damage
+from smp_motor_ident.bag.storage import note_damage
 from smp_motor_ident.bag.unpack import MAGIC, Budget, unpack_file
 from smp_motor_ident.errors import BagError
 
@@ -36,7 +36,7 @@ def open_source(path: Path, folder: Path, budget: Budget) -> Messages | Tables:
     except BagError as error:
         raise BagError("; ".join(filter(None, [str(error), problem]))) from None
     if problem:
-        source.problems.insert(0, report_damage(problem))
+        source.problems.insert(0, note_damage(problem))
     return source
 
 

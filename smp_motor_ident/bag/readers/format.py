@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from smp_motor_ident.bag.storage import TABLE, Batch, Channel, Table, report_damage
+from smp_motor_ident.bag.storage import TABLE, Batch, Channel, Table, note_damage
 from smp_motor_ident.bag.unpack import Budget
 from smp_motor_ident.errors import BagError
 from smp_motor_ident.finding import Finding
@@ -35,8 +35,8 @@ class Source(ABC):
     def channels(self) -> list[Channel]:
         """Return the channels, reading the whole file where it has no index."""
 
-    def _add_damage(self, text: str) -> None:
-        self.problems.append(report_damage(f"{self.name}: {text}"))
+    def _damage(self, text: str) -> None:
+        self.problems.append(note_damage(f"{self.name}: {text}"))
 
 
 class Messages(Source):

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from smp_motor_ident.bag.readers.format import check_width
-from smp_motor_ident.bag.storage import make_finding
+from smp_motor_ident.bag.storage import note
 from smp_motor_ident.bag.units import parse_unit
 from smp_motor_ident.errors import BagError
 from smp_motor_ident.finding import Finding
@@ -64,7 +64,7 @@ def head(rows: Sequence[Row], where: str) -> Grid:
     if not above:
         names = [f"c{k}" for k in range(1, width + 1)]
         text = f"{where}: has no row of names; its columns are called {names[0]} to {names[-1]}"
-        return Grid(names, {}, first, [make_finding("no_column_names", text)])
+        return Grid(names, {}, first, [note("no_column_names", text)])
     named, given = above[-1], [""] * width
     if len(above) > 1 and all(_is_empty(c) or parse_unit(_strip(c)) is not None for c in above[-1]):
         named, given = above[-2], [_strip(c) for c in above[-1]]
@@ -210,7 +210,7 @@ def columns(
     findings = []
     if stray:
         text = f"{where}: {len(stray)} rows without numbers were left out, the first in line "
-        findings.append(make_finding("stray_rows", f"{text}{lines[stray[0]]}", "warning"))
+        findings.append(note("stray_rows", f"{text}{lines[stray[0]]}", "warning"))
     values = np.array(kept).reshape(len(sound_rows), len(use))
     exact = [_convert(sound_rows, j, values[:, n]) for n, j in enumerate(use)]
     dates = {name for name, (_, timed) in zip(names, exact) if timed}

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from smp_motor_ident.bag.readers import grid
 from smp_motor_ident.bag.readers.format import ColumnFile, Format
-from smp_motor_ident.bag.storage import make_finding, report_damage
+from smp_motor_ident.bag.storage import note, note_damage
 from smp_motor_ident.bag.units import UNITS, needs, parse_unit
 from smp_motor_ident.bag.unpack import Budget
 from smp_motor_ident.errors import BagError
@@ -66,7 +66,7 @@ def _open(path: Path, name: str, budget: Budget) -> ColumnFile:
             columns = dict(islice(_columns("", document, 0, dates), round(MAX_COLUMNS) + 1))
         except RecursionError:
             raise BagError(f"{name}: is nested too deeply") from None
-    problems += [report_damage(problem)] if problem else []
+    problems += [note_damage(problem)] if problem else []
     return ColumnFile(path, name, columns, units, dates, problems, radius)
 
 
@@ -194,7 +194,7 @@ def _read_sysid(
     right = 2 * np.pi / UNITS["position"][unit].factor if unit and not rim else factor
     if document.get("unitsPerRotation") and abs(factor / right - 1) > _UNITS_TOLERANCE:
         text = f"{name}: says {factor:g} {unit} per rotation, which has {right:g}; correct it"
-        problems.append(make_finding("units_per_rotation", text, "warning", stated=factor))
+        problems.append(note("units_per_rotation", text, "warning", stated=factor))
         factor = right
     units = {}
     for key in columns:

@@ -11,7 +11,7 @@ import numpy as np
 
 from smp_motor_ident.bag.readers import apart
 from smp_motor_ident.bag.readers.format import ColumnFile, Format
-from smp_motor_ident.bag.storage import make_finding
+from smp_motor_ident.bag.storage import note
 from smp_motor_ident.bag.unpack import Budget
 from smp_motor_ident.errors import BagError
 
@@ -32,7 +32,7 @@ def _open(path: Path, name: str, budget: Budget) -> ColumnFile:
         raise BagError(advice)
     file = ColumnFile(path, name, columns)
     if head["objects"]:
-        file.problems.append(make_finding("matlab_object", advice, "warning"))
+        file.problems.append(note("matlab_object", advice, "warning"))
     return file
 
 

@@ -105,13 +105,13 @@ class _McapFile(Messages):
         if whole and not sound:
             index = self._chunks.get(start)
             many = f" with {index.messages} messages" if index and index.channels else ""
-            self._add_damage(f"the chunk at byte {start} is damaged and was left out{many}")
+            self._damage(f"the chunk at byte {start} is damaged and was left out{many}")
             return []
         positions, end = self._walk(data)
         if not whole:
             self._cut(start, f"inside a chunk; {len(positions)} of its messages could be read")
         elif end != len(data):
-            self._add_damage(
+            self._damage(
                 f"the chunk at byte {start} ends inside a record; "
                 f"{len(data) - end} of its bytes were left out"
             )
@@ -146,14 +146,14 @@ class _McapFile(Messages):
         at = np.array(positions, np.int64)
         length: Integers = gather(raw, at + 1, "<i8") - 22
         if (length < 0).any():
-            self._add_damage(f"{int((length < 0).sum())} messages too short")
+            self._damage(f"{int((length < 0).sum())} messages too short")
             at, length = at[length >= 0], length[length >= 0]
         ids = gather(raw, at + 9, "<u2")
         for key in np.unique(ids).tolist():
             channel = self._channels.get(key)
             which = ids == key
             if channel is None:
-                self._add_damage(
+                self._damage(
                     f"{int(which.sum())} messages of channel {key}, "
                     "which the file does not describe, were left out"
                 )
@@ -211,7 +211,7 @@ class _McapFile(Messages):
     def _cut(self, start: int, where: str) -> None:
         size = self.path.stat().st_size
         what = "damaged" if self._summary is not None else "cut off or damaged"
-        self._add_damage(f"{what} at byte {start} of {size} {where}".rstrip())
+        self._damage(f"{what} at byte {start} of {size} {where}".rstrip())
 
 
 FORMAT = Format("MCAP", (".mcap",), MAGIC, _McapFile, tables=False)

@@ -61,9 +61,7 @@ class _Ros1Bag(Messages):
                     whole = header.get_uint32("size")
                     data = decompress(file.read(length), packed, self._budget)
                     if len(data) != whole:
-                        self._add_damage(
-                            f"the chunk at byte {start} is damaged; its rest is left out"
-                        )
+                        self._damage(f"the chunk at byte {start} is damaged; its rest is left out")
                     yield from self._walk(io.BytesIO(data), len(data), wanted, inside=True)
                 elif kind == RecordType.CONNECTION:
                     self._connect(header, file.read(length))
@@ -74,13 +72,13 @@ class _Ros1Bag(Messages):
                     file.seek(length, io.SEEK_CUR)
             except _DAMAGE:
                 where = "inside a chunk" if inside else f"at byte {start} of {size}"
-                self._add_damage(f"cut off or damaged {where}")
+                self._damage(f"cut off or damaged {where}")
                 break
         batches = []
         for key, sent in messages.items():
             channel = self._channels.get(key)
             if channel is None:
-                self._add_damage(
+                self._damage(
                     f"{len(sent)} messages of connection {key}, which it does not describe"
                 )
             elif wanted(channel):

@@ -20,7 +20,7 @@ MAGIC = b"SQLite format 3\0"
 _MAX_BLOCK_ROWS = 8192
 _MIN_ROW_BYTES = 64  # minimum size of a row [byte]
 _TABLES = ("topics", "messages", "message_definitions")
-_BEFORE_FIRST_ID = -(2**63)
+_NO_ID = -(2**63)
 _MAX_BLOCK_BYTES = 1 << 25
 
 
@@ -50,7 +50,7 @@ class _SqliteFile(Messages):
         copy = make_temporary_folder(self) / self.path.name
         for original in (self.path, *journals):
             shutil.copyfile(original, copy.with_name(original.name))
-        self._add_damage(f"was not closed; its journal {journals[0].name} was applied to a copy")
+        self._damage(f"was not closed; its journal {journals[0].name} was applied to a copy")
         return copy
 
     def _connect(self, path: Path) -> sqlite3.Connection:
@@ -66,7 +66,7 @@ class _SqliteFile(Messages):
         page = 65536 if page == 1 else page
         pages = int.from_bytes(head[28:32], "big")
         if path == self.path and size < pages * page:
-            self._add_damage(f"cut off at byte {size} of {pages * page} that it had")
+            self._damage(f"cut off at byte {size} of {pages * page} that it had")
             self._cut_off = True
             # With this, SQLite reads a file shorter than stated in its header.
             database.execute("PRAGMA writable_schema=ON")
@@ -87,7 +87,7 @@ class _SqliteFile(Messages):
                 for kind, *given in self._database.execute(f"{query} FROM message_definitions"):
                     definitions[message_type(kind)] = tuple(given)
             except sqlite3.DatabaseError as error:
-                self._add_damage(f"its definitions cannot be read ({error})")
+                self._damage(f"its definitions cannot be read ({error})")
         names = ("serialization_format", "offered_qos_profiles")
         optional = ", ".join(name if name in columns else "''" for name in names)
         rows = self._database.execute(f"SELECT id, name, type, {optional} FROM topics ORDER BY id")
@@ -108,7 +108,7 @@ class _SqliteFile(Messages):
         asked = {channel.id: channel for channel in self._topics if wanted(channel)}
         if not asked:
             return
-        last = _BEFORE_FIRST_ID
+        last = _NO_ID
         try:
             if self._cut_off:
                 raise sqlite3.DatabaseError("cut off")
@@ -116,12 +116,8 @@ class _SqliteFile(Messages):
                 yield batches
         except sqlite3.DatabaseError as error:
             if not self._cut_off:
-                where = (
-                    "before its first message"
-                    if last == _BEFORE_FIRST_ID
-                    else f"behind message {last}"
-                )
-                self._add_damage(f"damaged {where} ({error})")
+                where = "before its first message" if last == _NO_ID else f"behind message {last}"
+                self._damage(f"damaged {where} ({error})")
             for rows in salvage(self._path_read):  # of single pages, after the last of the tree
                 wanted_rows = [row for row in rows if row[0] > last and row[1] in asked]
                 self._budget.take(sum(len(row[3]) for row in wanted_rows))
@@ -136,7 +132,7 @@ class _SqliteFile(Messages):
             "SELECT id, topic_id, timestamp, data FROM messages "
             f"WHERE id > ? {among}ORDER BY id LIMIT {_MAX_BLOCK_ROWS}"
         )
-        last = _BEFORE_FIRST_ID
+        last = _NO_ID
         while rows := self._read_rows(query, last):
             last = rows[-1][0]
             yield last, self._split(rows, asked)
@@ -165,7 +161,7 @@ class _SqliteFile(Messages):
             joined = join(every, list(blobs), np.array(times, np.int64))
         except (TypeError, OverflowError):
             sound = [r for r in rows if isinstance(r[3], bytes) and isinstance(r[2], int)]
-            self._add_damage(f"{len(rows) - len(sound)} messages without data were left out")
+            self._damage(f"{len(rows) - len(sound)} messages without data were left out")
             return self._split(sound, asked) if sound else []
         which = {key: np.flatnonzero(np.array(keys, np.int64) == key) for key in asked}
         return [replace(joined.take(k), channel=asked[key]) for key, k in which.items() if k.size]

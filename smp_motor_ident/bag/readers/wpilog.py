@@ -57,7 +57,7 @@ class _Wpilog(Tables):
             c = b + 1 + (sizes >> 4 & 7)
             size = int.from_bytes(data[a:b], "little")
             if c + size > end:
-                self._add_damage(f"cut off at byte {at} of {end}")
+                self._damage(f"cut off at byte {at} of {end}")
                 return
             key = int.from_bytes(data[at + 1 : a], "little")
             if key == 0:

@@ -20,7 +20,7 @@ import numpy as np
 
 _HEADER_BYTES = 128  # bytes of a file of version 5 before its first variable
 _MAX_DEPTH = 16
-_MAX_MATRIX_COLUMNS = 64  # columns of a matrix of signals; a wider matrix holds something else
+_MAX_COLUMNS = 64  # columns of a matrix of signals; a wider matrix holds something else
 _MAX_SHEET_ROWS = 1_048_576  # of a sheet, by Excel's own limits
 _MEMORY_LIMIT = resource.getrlimit(resource.RLIMIT_AS)[1]
 _READER_MEMORY = 1 << 26  # memory that readers need in addition to the file's contents [byte]
@@ -194,7 +194,7 @@ def _columns(
         yield prefix, value
     elif value.ndim == 2:
         rows = value if value.shape[0] >= value.shape[1] else value.T
-        if rows.shape[1] <= _MAX_MATRIX_COLUMNS:
+        if rows.shape[1] <= _MAX_COLUMNS:
             for k in range(rows.shape[1]):
                 yield f"{prefix}[{k}]", rows[:, k]
 
@@ -204,10 +204,7 @@ def _parts(prefix: str, value: Any) -> list[tuple[str, Any]] | None:
     if isinstance(value, Mapping):
         return [(f"{prefix}.{k}" if prefix else str(k), inner) for k, inner in value.items()]
     if isinstance(value, list) or (isinstance(value, np.ndarray) and value.dtype == object):
-        return [
-            (f"{prefix}[{k}]", inner)
-            for k, inner in enumerate(np.ravel(value)[:_MAX_MATRIX_COLUMNS])
-        ]
+        return [(f"{prefix}[{k}]", inner) for k, inner in enumerate(np.ravel(value)[:_MAX_COLUMNS])]
     return None
 
 
