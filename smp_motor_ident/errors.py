@@ -3,8 +3,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 from smp_motor_control.errors import ParameterError as ParameterError
 from smp_motor_control.errors import SmpError as SmpError
 
@@ -27,12 +25,6 @@ class InsufficientExcitationError(SmpError):
     """The data do not support the answer; the message says what to record next."""
 
     exit_code = 1
-
-
-class UnknownLagError(InsufficientExcitationError):
-    """The data determine a gain but no time constant; ``estimate`` is the partial answer."""
-
-    estimate: Any = None
 
 
 class DesignError(SmpError):

@@ -168,10 +168,7 @@ class ModelError:
 
 @dataclass(frozen=True)
 class ResidualTests:
-    """Whiteness of the residuals, independence from the input (95 % bands), error by frequency.
-
-    The verdicts are based on the correlations, which are for the report and not in the JSON.
-    """
+    """Whiteness of the residuals, independence of the input (95 % bands), error by frequency."""
 
     white: bool | None = None
     independent_of_input: bool | None = None

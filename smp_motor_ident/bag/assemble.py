@@ -116,7 +116,7 @@ def _check_series(motor: Context, series: dict[str, Series]) -> None:
                 )
             if checks.has_two_publishers(value.astype(np.float64)):
                 raise BagError(
-                    f"{motor.where}: the count jumps to and fro between two counters, so that two "
+                    f"{motor.where}: the count alternates between two counters, so that two "
                     "nodes published it at once; stop one of them and record again"
                 )
             count = unwrap_counts(motor, series).count

@@ -102,8 +102,6 @@ def parse_mapping(items: Iterable[str], msg_files: Iterable[str] = ()) -> Signal
     KEY is a signal, a property of the hardware or an option; an item may hold several, separated by
     blanks.
     """
-    if isinstance(items, str):
-        items = [items]
     document: dict[str, Any] = {}
     motors: dict[str, dict[str, Any]] = {}
     parts = (part for whole in items for part in _ITEM_SEPARATOR.split(whole.strip()))

@@ -150,10 +150,7 @@ def find_unit(signal: str, written: str, name: str) -> str:
 
 
 def factor(signal: str, unit: str, known: Mapping[str, float | None]) -> float:
-    """Return the factor from a unit to SI; raise `BagError` if a property is missing.
-
-    Unknown properties of the robot are None or 0.
-    """
+    """Return the factor from a unit to SI; BagError if a property is unknown (None or 0)."""
     result, needed = UNITS[signal][unit]
     for name, power in needed.items():
         if not (value := known.get(name)):

@@ -16,10 +16,7 @@ SMOOTHING_SAMPLES = 9  # length of a moving mean that keeps the motion of a coun
 
 
 def refuse_saturation(record: Record, speed: Array, where: str) -> Iterator[Finding]:
-    """Refuse a speed or current that rests at its limit while the voltage moves.
-
-    Yield a finding for a current that a driver regulates.
-    """
+    """Refuse a speed or current at its limit; yield a finding for a regulated current."""
     regulated = 0.0
     for name, unit in (("velocity", "rad/s"), ("current", "A")):
         values = getattr(record, name)

@@ -10,7 +10,6 @@ repeated stamps, which round a regular time down, lie above such a line, too.
 
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import Any
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
@@ -257,10 +256,6 @@ def merge_bunches(record: Record) -> Record:
     if kept.size < 2:
         return record
     share = 1.0 - kept.size / len(record)
-    arrays: dict[str, Any] = {
-        name: None if (values := getattr(record, name)) is None else values[kept]
-        for name in ("time", "current", "velocity", "position", "count")
-    }
     finding = Finding(
         "stamps_equal",
         "warning",
@@ -270,11 +265,10 @@ def merge_bunches(record: Record) -> Record:
         "stamp each sample where it is measured, with a clock finer than the sampling interval",
     )
     return replace(
-        record,
+        record.take(kept),
         voltage=np.add.reduceat(record.voltage, first) / np.diff(np.append(first, len(record))),
         starts=tuple(int(k) for k in np.searchsorted(kept, starts)),
         findings=(*record.findings, finding),
-        **arrays,
     )
 
 

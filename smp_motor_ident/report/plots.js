@@ -84,18 +84,21 @@
     };
     for (const name of ["bandwidth", "margin"]) part(name).addEventListener("input", show);
     part("wheel").addEventListener("change", choose);
-    part("copy").addEventListener("click", async () => {
-      try {
-        await navigator.clipboard.writeText(part("yaml").textContent);
-        part("copied").textContent = "copied";
-      } catch {
-        getSelection().selectAllChildren(part("yaml"));
-        part("copied").textContent = "marked: press Ctrl-C";
-      }
-    });
     update = show;
     choose();
   }
+
+  // A button copies the text of the element that it names; the element behind the button says so.
+  for (const button of document.querySelectorAll("button[data-copy]")) button.addEventListener("click", async () => {
+    const text = document.querySelector(button.dataset.copy), status = button.nextElementSibling;
+    try {
+      await navigator.clipboard.writeText(text.textContent);
+      status.textContent = "copied";
+    } catch {
+      getSelection().selectAllChildren(text);
+      status.textContent = "selected: press Ctrl-C";
+    }
+  });
 
   addEventListener("beforeprint", () => document.querySelectorAll("details").forEach(one => { one.open = true; }));
   const redraw = () => plots.forEach(plot => plot.u.redraw(false, true));

@@ -259,10 +259,7 @@ class StepFigures:
 
 
 def find_last_exit(time: Array, outside: NDArray[np.bool_]) -> Array:
-    """Return the time from which signals, shape (..., k), stay inside their band.
-
-    NaN for signals that end outside.
-    """
+    """Return the time from which signals, shape (..., k), stay in their band; NaN if they leave."""
     inside = np.argmax(outside[..., ::-1], axis=-1)
     begin = np.where(outside.any(axis=-1), time.size - inside, 0)
     return np.asarray(np.append(time, math.nan)[begin], dtype=np.float64)

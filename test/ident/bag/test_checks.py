@@ -85,7 +85,7 @@ def test_a_counter_that_turns_to_and_fro_where_it_wraps_loses_no_sample(tmp_path
 def test_a_count_of_two_publishers_is_named(tmp_path, every):
     count = COUNT.copy()
     count[::every] = 70_000  # a forgotten node whose motor stands
-    with pytest.raises(BagError, match=r"jumps to and fro.*two nodes published it"):
+    with pytest.raises(BagError, match=r"alternates between two counters.*two nodes published it"):
         read_count(tmp_path / "log.csv", count)
     count[::every] = COUNT[::every] + 900  # closer than a wheel turns in a sample
     read_count(tmp_path / "log.csv", count)
