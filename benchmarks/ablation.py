@@ -27,7 +27,7 @@ import smp_motor_ident.fit.search as search
 import smp_motor_ident.infer.uncertainty as uncertainty
 from smp_motor_ident.chain.catalogue import find_component
 
-SHARE = 0.8  # of the records, those that cost least
+SHARE = 0.8  # share of the records: those with the lowest cost
 Patch = tuple[Any, str, Any]
 simulate, find, guess, noise = chain.simulate, search.search, search.guess_motors, descend.fit_noise
 

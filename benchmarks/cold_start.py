@@ -26,8 +26,8 @@ CASES = {
     "friction and torque noise, with current": (True, True, 0.2),
     "friction, voltage only": (False, True, 0.0),
 }
-FAR = 5.0  # standard deviations beyond which an answer is wrong: none in 3 million by chance
-NEAR = 0.05  # part of the truth within which gain and time constant are of the right minimum
+FAR = 5.0  # standard deviations of a wrong answer: one in 2 million by chance
+NEAR = 0.05  # relative error of gain and time constant at the right minimum
 
 
 def motor(rng: np.random.Generator) -> tuple[float, ...]:

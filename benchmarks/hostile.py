@@ -154,7 +154,7 @@ NUMBER = CDR + struct.pack("<d", 1.0)
 
 
 def layout(k: int) -> bytes:
-    """Return a message of two strings, whose lengths are its own, and a number."""
+    """Return a message with two strings of individual lengths, and a number."""
     data = b""
     for length in divmod(k, 300):
         data += bytes(-len(data) % 4) + struct.pack("<I", 1 + length) + bytes(1 + length)

@@ -100,7 +100,7 @@ def substeps(motor: MotorParameters, step: float) -> int:
 
 
 def motor_of(parameters: tuple[float, ...], static_voltage: float) -> MotorParameters:
-    """Return the motor of R, L, K, J, b and the voltage at which it breaks loose."""
+    """Return the motor with R, L, K, J, b and a breakaway voltage."""
     torque = static_voltage * parameters[2] / parameters[0]
     return MotorParameters(**dict(zip(PHYSICAL, (*parameters, torque))))
 

@@ -2,7 +2,7 @@
 """Check the sections of docstrings with numpydoc's validator, as [tool.numpydoc_validation] says.
 
 Sections are for the public API (`PUBLIC` and docstrings that have one); elsewhere a line suffices.
-A function without arguments whose summary tells its result (a property, or ``"Return the ..."``)
+A function without arguments whose summary states its result (a property, or ``"Return the ..."``)
 needs no Returns section. Nested functions are exempt.
 """
 

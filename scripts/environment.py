@@ -86,7 +86,7 @@ def find_ros() -> str:
 
 
 def check_machine(ros: str) -> None:
-    """Raise `SetupError` for what pip and colcon would only report in many lines, and late."""
+    """Raise `SetupError` for missing tools that pip and colcon report late."""
     try:
         import ensurepip  # noqa: F401
         import venv  # noqa: F401
@@ -132,7 +132,7 @@ def fingerprint(*parts: str, files: Iterable[Path] = (), names: Iterable[Path] =
 
 
 def stage_keys(ros: str) -> dict[str, str]:
-    """Return a key per stage over all that its result depends on."""
+    """Return a key for each stage over all its inputs."""
     python = fingerprint(LAYOUT, str(ROOT), sys.version, os.path.realpath(PYTHON), ros)
     packages = fingerprint(python, files=[requirements(ros)])
     package = fingerprint(
@@ -152,7 +152,7 @@ def requirements(ros: str) -> Path:
 
 
 def environment(ros: str) -> dict[str, str]:
-    """Return the environment for pip, CMake and colcon: nothing of another Python or ROS in it."""
+    """Return the environment for pip, CMake and colcon, without another Python or ROS."""
     foreign = FOREIGN if ros else FOREIGN | FOREIGN_TO_WHEELS
     env = {name: value for name, value in os.environ.items() if name not in foreign}
     env["PATH"] = f"{VENV}/bin{os.pathsep}{env['PATH']}"
@@ -209,7 +209,7 @@ def make_venv(ros: str, lock: IO[str]) -> None:
 
 
 def install_packages(ros: str, lock: IO[str]) -> None:
-    """Install the lock file as it stands; every transitive dependency is in it, with its hashes."""
+    """Install the lock file, which has every transitive dependency with its hashes."""
     lockfile = requirements(ros)
     options = ["--no-deps", "--no-input", "--disable-pip-version-check", "--progress-bar=off"]
     options.append("--require-hashes")
@@ -264,7 +264,7 @@ def verify(ros: str, lock: IO[str]) -> None:
 
 
 def prepare(lock: IO[str]) -> bool:
-    """Redo the stages whose inputs changed; return whether anything was to be done."""
+    """Redo the stages whose inputs changed; return whether there were any."""
     ros = find_ros()
     keys = stage_keys(ros)
     try:
@@ -309,7 +309,7 @@ def prepare(lock: IO[str]) -> bool:
 
 
 def write(path: Path, text: str) -> None:
-    """Write a file so that it is either the old one or the whole new one."""
+    """Replace a file atomically."""
     partial = path.with_suffix(".partial")
     partial.write_text(text)
     partial.replace(path)

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Print the nodes' topics, services and parameters: ``python scripts/nodes.py > docs/nodes.md``.
 
-Each node is made as its executable makes it, and asked.
+Each node is created as by its executable, and inspected.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Draw the pictures of the pages: ``make pictures``, which takes six minutes.
 
-The simulated robot is identified, tuned, driven and commissioned; headless Chromium shows the pages
-that this writes. An argument names a folder in which an earlier run's results are, or will be kept.
+The simulated robot is identified, tuned, driven and commissioned, and headless Chromium shows the
+resulting pages. An argument names a folder that keeps the results for later runs.
 """
 
 from __future__ import annotations
@@ -30,24 +30,24 @@ from browser import CHROMIUM, Browser, Clicks  # noqa: E402
 from smp_motor_control.nodes import loopback  # noqa: E402
 
 DOMAIN = "87"
-"""ROS domain of the simulated robot, where none is set."""
+"""Default ROS domain of the simulated robot."""
 WIDTH = 1280
-"""Of the window [px]."""
+"""Width of the window [px]."""
 COLOURS = 96
-"""Of a picture: charts and text need no more, and a picture stays below 100 kB."""
+"""Colours of a picture, which keep it below 100 kB."""
 PARTS = {
     "report": ("tuned/report.html", ("#front_left",)),
     "tuning": ("tuned/report.html", ("#tuning h2", "#figure-tuning-step", "#figure-tuning-load")),
     "commissioning": ("trial/report.html", ("h1", "#results")),
 }
-"""Per picture the page, and the first and last of its parts that are shown."""
+"""Page of each picture, and its outermost elements."""
 LAB = {
     "watch": (".bar", ".grid"),
     "identify": ("#identify-title", "#motors"),
     "tune": ("#tune-title", ".sliders", "#tune-charts"),
     "drive": ("#drive-title", "#settled"),
 }
-"""Per picture of the page of lab, the outermost of its parts that are shown."""
+"""Outermost elements of each picture of the page of lab."""
 
 
 @contextmanager
@@ -94,7 +94,7 @@ def draw(folder: Path) -> None:
 
 
 def draw_lab(folder: Path) -> None:
-    """Write the pictures of the page of lab, which is used meanwhile."""
+    """Use the page of lab, and write its pictures."""
     log = folder / "lab.log"
     shutil.rmtree(folder / "lab_output", ignore_errors=True)
     command = f"cd '{folder}' && exec lab --demo --no-browser > lab.log 2>&1"

@@ -93,7 +93,7 @@ def reconstruct(record: Record, loop: KnownLoop, numbers: Mapping[str, float]) -
 
 
 def _check_interval(record: Record, loop: KnownLoop, numbers: Mapping[str, float]) -> float:
-    """Return the loop's interval, which is the log's [s]."""
+    """Return the interval of the loop [s]; SignalError if the log has another one."""
     logged, T = record.sample_time, loop.interval(numbers)
     if math.isnan(T):
         return logged

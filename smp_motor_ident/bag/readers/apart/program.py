@@ -133,7 +133,7 @@ def _contents(data: bytes, objects: list[str], memory: int) -> Iterator[dict[str
         def take(key: str, item: Any) -> None:
             if not isinstance(item, h5py.Dataset) or "#" in key:
                 return
-            if "MATLAB_object_decode" in item.attrs:  # references, in whole numbers
+            if "MATLAB_object_decode" in item.attrs:  # references, stored as integers
                 objects.append(f"{key} ({_printable(item.attrs.get('MATLAB_class', b''))})")
             elif item.dtype.kind in "fiub":
                 taken[key.replace("/", ".")] = np.asarray(item).T  # MATLAB counts columns first
