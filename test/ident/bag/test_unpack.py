@@ -13,7 +13,13 @@ import pytest
 from backports import zstd
 
 from smp_motor_ident.bag.storage import Channel, join
-from smp_motor_ident.bag.unpack import Budget, decompress, decompress_messages, pieces, unpack_file
+from smp_motor_ident.bag.unpack import (
+    Budget,
+    decompress,
+    decompress_messages,
+    decompress_stream,
+    unpack_file,
+)
 from smp_motor_ident.errors import BagError
 
 PACK: dict[str, Callable[[bytes], bytes]] = {
@@ -49,14 +55,14 @@ def test_frames_come_out_whole_whatever_the_blocks_they_are_read_in(kind):
         if length == 1 and kind == "bz2":
             continue  # slow and no other way
         blocks = [packed[k : k + length] for k in range(0, len(packed), length)]
-        assert b"".join(pieces(blocks, kind)) == PLAIN
-    biggest = max(len(piece) for piece in pieces([packed], kind))
+        assert b"".join(decompress_stream(blocks, kind)) == PLAIN
+    biggest = max(len(piece) for piece in decompress_stream([packed], kind))
     # 1024 bytes of zstd expand to at most 256 blocks of 128 KiB; the others come by the MiB.
     assert biggest <= (256 << 17 if kind == "zstd" else 1 << 20)
     with pytest.raises(EOFError):
-        list(pieces([], kind))
+        list(decompress_stream([], kind))
     with pytest.raises(EOFError):
-        list(pieces([packed[:-20]], kind))
+        list(decompress_stream([packed[:-20]], kind))
 
 
 @pytest.mark.parametrize("kind", PACK)
@@ -88,7 +94,7 @@ def test_the_limit_follows_from_the_size_or_from_the_user(given, limit, monkeypa
     assert big.limit == (limit if given else 5e9)  # 50 times the packed size
     for wrong in ("much", "inf", "K"):
         monkeypatch.setenv("SMP_BAG_UNPACKED", wrong)
-        with pytest.raises(BagError, match="give bytes, or such as 512M or 8G"):
+        with pytest.raises(BagError, match="give bytes, or a size such as 512M or 8G"):
             Budget("a.mcap", 1)
 
 
