@@ -8,11 +8,14 @@ import io
 import struct
 from typing import BinaryIO, NamedTuple
 
+from rosbags.rosbag2.errors import ReaderError
+from rosbags.rosbag2.storage_mcap import read_bytes, read_string
+
 MAGIC = b"\x89MCAP0\r\n"
 FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK, CHUNK_INDEX = 2, 3, 4, 5, 6, 8
 STATISTICS, DATA_END = 11, 15
 HEAD = struct.Struct("<BQ")  # every record's opcode and length in bytes
-DAMAGE = (struct.error, ValueError, OverflowError)
+DAMAGE = (struct.error, ValueError, OverflowError, ReaderError)
 _FOOTER = struct.Struct("<BQQQI")  # with its head
 
 
@@ -52,71 +55,53 @@ class Summary(NamedTuple):
     chunks: dict[int, ChunkIndex]  # by where they begin
 
 
-class _Fields:
-    """Reads the fields of a record in their order."""
-
-    def __init__(self, data: bytes) -> None:
-        self._data = data
-        self.at = 0
-
-    def numbers(self, kinds: str) -> tuple[int, ...]:
-        found = struct.unpack_from("<" + kinds, self._data, self.at)
-        self.at += struct.calcsize("<" + kinds)
-        return found
-
-    def block(self) -> bytes:
-        (length,) = self.numbers("I")
-        begin, self.at = self.at, self.at + length
-        if self.at > len(self._data):
-            raise ValueError("a record ends early")
-        return self._data[begin : self.at]
-
-    def text(self) -> str:
-        return self.block().decode()
+def _numbers(file: BinaryIO, kinds: str) -> tuple[int, ...]:
+    """Read numbers of the given struct kinds."""
+    return struct.unpack("<" + kinds, file.read(struct.calcsize("<" + kinds)))
 
 
 def read_schema(body: bytes) -> Schema:
     """Read a schema."""
-    fields = _Fields(body)
-    (key,) = fields.numbers("H")
-    return Schema(key, fields.text(), fields.text(), fields.block())
+    file = io.BytesIO(body)
+    (key,) = _numbers(file, "H")
+    return Schema(key, read_string(file), read_string(file), read_bytes(file))
 
 
 def read_channel(body: bytes) -> Channel:
     """Read a channel."""
-    fields = _Fields(body)
-    key, schema = fields.numbers("HH")
-    topic, encoding, held = fields.text(), fields.text(), fields.block()
-    pairs, metadata = _Fields(held), dict[str, str]()
-    while pairs.at < len(held):
-        name = pairs.text()
-        metadata[name] = pairs.text()
+    file = io.BytesIO(body)
+    key, schema = _numbers(file, "HH")
+    topic, encoding, held = read_string(file), read_string(file), read_bytes(file)
+    pairs, metadata = io.BytesIO(held), dict[str, str]()
+    while pairs.tell() < len(held):
+        name = read_string(pairs)
+        metadata[name] = read_string(pairs)
     return Channel(key, schema, topic, encoding, metadata)
 
 
 def read_chunk(body: bytes) -> tuple[int, int, str, bytes]:
     """Read a chunk: its size and CRC (0 if absent) unpacked, its compression and packed bytes."""
-    fields = _Fields(body)
-    _, _, size, crc = fields.numbers("QQQI")
-    compression, (stored,) = fields.text(), fields.numbers("Q")
-    return size, crc, compression, body[fields.at :][:stored]
+    file = io.BytesIO(body)
+    _, _, size, crc = _numbers(file, "QQQI")
+    compression, (stored,) = read_string(file), _numbers(file, "Q")
+    return size, crc, compression, body[file.tell() :][:stored]
 
 
 def read_chunk_index(body: bytes) -> ChunkIndex:
     """Read the index of a chunk."""
-    fields = _Fields(body)
-    _, _, start, _ = fields.numbers("QQQQ")
-    channels = tuple(key for key, _ in struct.iter_unpack("<HQ", fields.block()))
-    (length,) = fields.numbers("Q")
+    file = io.BytesIO(body)
+    _, _, start, _ = _numbers(file, "QQQQ")
+    channels = tuple(key for key, _ in struct.iter_unpack("<HQ", read_bytes(file)))
+    (length,) = _numbers(file, "Q")
     # Behind a chunk, each channel's index record is 15 bytes and 16 per message.
     return ChunkIndex(start, channels, (length - 15 * len(channels)) // 16)
 
 
 def read_statistics(body: bytes) -> tuple[int, dict[int, int]]:
     """Read the number of channels, and the number of messages by channel."""
-    fields = _Fields(body)
-    _, _, channels, _, _, _, _, _ = fields.numbers("QHIIIIQQ")
-    return channels, dict(struct.iter_unpack("<HQ", fields.block()))
+    file = io.BytesIO(body)
+    _, _, channels, _, _, _, _, _ = _numbers(file, "QHIIIIQQ")
+    return channels, dict(struct.iter_unpack("<HQ", read_bytes(file)))
 
 
 def read_summary(file: BinaryIO) -> Summary | None:
