@@ -128,7 +128,7 @@ def systematic(quantity: Quantity) -> str:
         size = f"{_format_two_digits(100 * one.share)} %" if one.share is not None else unit
         words.append(f"± {size} ({cause(one.cause)})")
     volts = (quantity.valid or {}).get("voltage")
-    return ", ".join([*words, *([f"seen at ±{volts[1]:.3g} V only"] if volts else [])])
+    return ", ".join([*words, *([f"observed at ±{volts[1]:.3g} V only"] if volts else [])])
 
 
 def cause(name: str) -> str:
