@@ -116,7 +116,7 @@ def _list_drive_rows(
 
 
 def _format_figure(scale: float, value: float | None) -> str:
-    return "—" if value is None else f"{round(scale * value, 2):.3g}"
+    return "—" if value is None else words.format_figure(round(scale * value, 2))
 
 
 def charts(changes: Sequence[Change]) -> list[Chart]:

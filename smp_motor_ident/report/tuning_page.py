@@ -183,6 +183,9 @@ def describe(one: Choice) -> dict[str, Any]:
 def _list_figures(found: Design) -> list[tuple[str, str, str]]:
     """Return name, value and band of the design's figures."""
     bands, gains, settling = found.specification, found.gains, found.settling
+    abrupt, noise = (
+        words.format_figure(1e3 * x) for x in (settling.abrupt, found.performance.control_noise)
+    )
     return [
         ("Crossover", f"{found.margins.crossover:.4g} rad/s", ""),
         ("Phase margin", *_format_band(bands.phase_margin, 1.0, "°")),
@@ -193,11 +196,11 @@ def _list_figures(found: Design) -> list[tuple[str, str, str]]:
         (
             f"Duration of a planned change by {settling.change:.3g} rad/s"
             f"{', the same for all wheels' if settling.common else ''}",
-            f"{1e3 * settling.transition:.3g} ms",
+            f"{words.format_figure(1e3 * settling.transition)} ms",
             "",
         ),
-        ("Settling of an abrupt change, feedback alone", f"{1e3 * settling.abrupt:.3g} ms", ""),
-        ("Control noise", f"{1e3 * found.performance.control_noise:.3g} mV", ""),
+        ("Settling of an abrupt change, feedback alone", f"{abrupt} ms", ""),
+        ("Control noise", f"{noise} mV", ""),
         ("p", f"{gains.p:.4g} V s/rad", ""),
         ("i", f"{gains.i:.4g} V/rad", ""),
         ("d", f"{gains.d:.4g} V s²/rad", ""),
@@ -205,7 +208,9 @@ def _list_figures(found: Design) -> list[tuple[str, str, str]]:
 
 
 def _format_band(band: specification.Band, scale: float, unit: str) -> tuple[str, str]:
-    value, low, high = (f"{round(scale * v, 3):.3g}" for v in (band.value, band.low, band.high))
+    value, low, high = (
+        words.format_figure(round(scale * v, 3)) for v in (band.value, band.low, band.high)
+    )
     return f"{value}{unit}", f"{low} … {high}{unit}"
 
 

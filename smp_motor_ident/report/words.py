@@ -89,7 +89,7 @@ def interval(quantity: Quantity) -> str:
     if shown.ci95 is None:
         return "—"
     if shown.value is None or not shown.std:
-        return " … ".join(map(_format_end, shown.ci95))
+        return " … ".join(map(format_figure, shown.ci95))
     return _format_numbers(" … ", shown.ci95, shown)
 
 
@@ -110,9 +110,11 @@ def _format_fixed(value: float, places: int) -> str:
     return f"{rounded:.{max(places, 0)}f}" if rounded or not value else f"{value:.1e}"
 
 
-def _format_end(end: float) -> str:
-    """Return the end of a range with three digits."""
-    return "∞" if math.isinf(end) else f"{end:.0f}" if 100 <= abs(end) < 1e6 else f"{end:.3g}"
+def format_figure(value: float) -> str:
+    """Return a number with three digits, without an exponent up to a million."""
+    if math.isinf(value):
+        return "∞"
+    return f"{value:.0f}" if 100 <= abs(value) < 1e6 else f"{value:.3g}"
 
 
 def _append_unit(text: str, unit: str) -> str:
