@@ -3,7 +3,8 @@
 # Installs the last commit as strangers do and runs it to the end: `scripts/stranger.sh [pip] [colcon]`, default both.
 #   pip     `pip install .` in an empty environment: a CSV file to its report and gains.
 #   colcon  plain `colcon build` beside two other packages: a simulated robot is recorded, identified, tuned and driven.
-# Works in the shell of setup.bash and where ROS is sourced. WORKSPACE names the folder; default: a temporary one.
+# pip works in any shell (PYTHON chooses the Python), colcon in that of setup.bash and where ROS is sourced.
+# WORKSPACE names the folder; default: a temporary one.
 set -eu
 export ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST
 root=$(cd -- "$(dirname -- "${BASH_SOURCE[0]}")/.." && pwd -P)
@@ -23,7 +24,7 @@ by_pip() {
   git -C "$root" archive HEAD | tar -x -C source
   # Nothing of ROS or of this repository's own environment is seen.
   local clean=(env -u PYTHONPATH -u LD_LIBRARY_PATH -u AMENT_PREFIX_PATH -u VIRTUAL_ENV -u _ROS_WHEELS_BOOTSTRAP_COMPLETE)
-  run venv "${clean[@]}" "$(python3 -c 'import sys; print(sys._base_executable)')" -m venv venv
+  run venv "${clean[@]}" "$("${PYTHON:-python3}" -c 'import sys; print(sys._base_executable)')" -m venv venv
   local size; size=$(du -sm venv | cut -f1)  # pip of the environment itself
   run install "${clean[@]}" venv/bin/pip install --disable-pip-version-check ./source
   size=$(($(du -sm venv | cut -f1) - size))
