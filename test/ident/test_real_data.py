@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Real motors' recordings, as published (see their README for source and licence)."""
 
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -8,6 +9,7 @@ import pytest
 
 from smp_motor_ident.estimate import estimate
 from smp_motor_ident.record import Record
+from smp_motor_ident.result import Estimate
 
 DATA = Path(__file__).parents[3] / "shared" / "data"
 pytestmark = pytest.mark.skipif(not DATA.exists(), reason="recordings are not at hand")
@@ -18,6 +20,11 @@ def prbs(day: str) -> Record:
     return Record("motor", table["t"], table["u"], velocity=np.radians(table["y"]), source=day)
 
 
+@cache
+def estimate_day(day: str, kept: str = "") -> Estimate:
+    return estimate(prbs(day), validation=[prbs(kept)] if kept else None)
+
+
 def step(path: Path) -> Record:
     table = np.genfromtxt(path, delimiter=",", skip_header=1)
     volts = table[:, 2] / 5319 * 12.0
@@ -25,11 +32,13 @@ def step(path: Path) -> Record:
     return Record("motor", table[:, 0] * 1e-3, volts, velocity=speed, source=path.name)
 
 
-@pytest.mark.parametrize(
-    ("fitted", "kept"), [("2026-08-14", "2026-08-18"), ("2026-08-18", "2026-08-14")]
-)
+EACH_OTHER = (("2026-08-14", "2026-08-18"), ("2026-08-18", "2026-08-14"))
+OTHERS = (("2026-08-11",), ("2026-08-15",), ("2026-08-17",))
+
+
+@pytest.mark.parametrize(("fitted", "kept"), EACH_OTHER)
 def test_prbs_of_one_day_explains_the_other_day(fitted, kept):
-    result = estimate(prbs(fitted), validation=[prbs(kept)])
+    result = estimate_day(fitted, kept)
     # The owner's static curve; 3 % and the range of tau are from the data's README.
     assert np.degrees(result.value("dc_gain")) == pytest.approx(159.9, rel=0.03)
     assert 0.030 < result.value("time_constant") < 0.042
@@ -39,7 +48,8 @@ def test_prbs_of_one_day_explains_the_other_day(fitted, kept):
 
 
 def test_five_days_scatter_no_more_than_the_intervals_of_each():
-    found = [estimate(prbs(f"2026-08-{day}")).combinations for day in (11, 14, 15, 17, 18)]
+    estimates = [estimate_day(*days) for days in (*EACH_OTHER, *OTHERS)]
+    found = [one.combinations for one in estimates]
     for name in ("dc_gain", "time_constant", "static_voltage"):
         # The load differs from day to day, which no recording of one shows.
         value, std = (

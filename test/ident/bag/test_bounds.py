@@ -78,14 +78,18 @@ def bomb(kind: str, size: int) -> bytes:
 def test_a_bomb_is_refused_within_bounded_memory(tmp_path, kind):
     path = tmp_path / f"bag.mcap.{kind}"
     path.write_bytes(bomb(kind, 400_000_000))
+    # VmHWM starts anew with a process; ru_maxrss includes the parent's peak.
     code = (
-        "import sys, resource\n"
+        "import re, sys\n"
+        "from pathlib import Path\n"
         "from smp_motor_ident.bag import read_records\n"
         "from smp_motor_ident.errors import BagError\n"
-        "before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss\n"
+        "status = Path('/proc/self/status')\n"
+        "peak = lambda: int(re.findall(r'VmHWM:\\s+(\\d+)', status.read_text())[0])\n"
+        "before = peak()\n"
         "try:\n    read_records(sys.argv[1])\n"
         "except BagError as error:\n    print(error)\n"
-        "print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before)\n"
+        "print(peak() - before)\n"
     )
     command = [sys.executable, "-c", code, str(path)]
     done = subprocess.run(command, capture_output=True, text=True, check=True, cwd=ROOT)
