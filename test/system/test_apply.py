@@ -12,7 +12,9 @@ import numpy as np
 import pytest
 import rclpy
 import yaml
-from rcl_interfaces.srv import GetParameters
+from processes import own_domain, processes
+from rcl_interfaces.srv import GetParameters, SetParameters
+from rclpy.parameter import Parameter
 from sensor_msgs.msg import JointState
 
 from smp_interfaces.msg import MotorState
@@ -26,6 +28,7 @@ MOTORS = ROOT / "config" / "motors_paper.yaml"
 PERIOD = 1 / 200
 """Of the plant's samples [s]."""
 
+GAINS = {"p": 1.0, "i": 15.0, "d": 0.0}
 SPEED = 1.2
 """Set-point of the wheels [rad/s], well within reach of the slowest."""
 
@@ -41,7 +44,7 @@ class Robot:
         self.publisher = self.node.create_publisher(JointState, "/wheel_setpoints", 1)
         self.node.create_timer(0.05, self._drive)
         self.speeds: dict[str, list[tuple[float, float]]] = {wheel: [] for wheel in WHEELS}
-        self.readers = {}
+        self.readers, self.writers = {}, {}
         for wheel, seen in self.speeds.items():
             self.node.create_subscription(
                 MotorState,
@@ -49,8 +52,9 @@ class Robot:
                 lambda m, seen=seen: seen.append((time.monotonic(), m.velocity)),
                 rclpy.qos.qos_profile_sensor_data,
             )
-            name = f"/{wheel}/wheel_pid/get_parameters"
-            self.readers[wheel] = self.node.create_client(GetParameters, name)
+            name = f"/{wheel}/wheel_pid"
+            self.readers[wheel] = self.node.create_client(GetParameters, f"{name}/get_parameters")
+            self.writers[wheel] = self.node.create_client(SetParameters, f"{name}/set_parameters")
         self.executor = LeanExecutor()
         self.executor.add_node(self.node)
         self.running = True
@@ -81,15 +85,28 @@ class Robot:
         return all(abs(self.mean_speed(wheel) - SPEED) < 0.1 * SPEED for wheel in WHEELS)
 
     def gain(self, wheel: str, name: str = "p") -> float:
+        request = GetParameters.Request(names=[name])
+        return self._ask(self.readers[wheel], request).values[0].double_value
+
+    def set_gains(self, wheel: str) -> None:
+        parameters = [
+            Parameter(name, value=value).to_parameter_msg() for name, value in GAINS.items()
+        ]
+        results = self._ask(
+            self.writers[wheel], SetParameters.Request(parameters=parameters)
+        ).results
+        assert all(one.successful for one in results), results
+
+    def _ask(self, client, request):
         """Ask until there is an answer: one is lost where discovery is half-way."""
         end = time.monotonic() + 20.0
         while time.monotonic() < end:
             answered = threading.Event()
-            future = self.readers[wheel].call_async(GetParameters.Request(names=[name]))
+            future = client.call_async(request)
             future.add_done_callback(lambda _, answered=answered: answered.set())
             if answered.wait(1.0):
-                return future.result().values[0].double_value
-        pytest.fail(f"{wheel}: wheel_pid does not tell its {name} within 20 s")
+                return future.result()
+        pytest.fail(f"{client.srv_name} does not answer within 20 s")
 
     def slowest(self, begin: float, end: float) -> float:
         """Least mean speed of any wheel over any tenth of a second of a stretch of time."""
@@ -102,58 +119,71 @@ class Robot:
         return least
 
 
-@pytest.fixture
-def robot(process, eventually, tmp_path):
-    gains = tmp_path / "start.yaml"
+@pytest.fixture(scope="module", autouse=True)
+def ros_domain():
+    """Give all tests of this file one domain, in which their robot runs."""
+    with own_domain() as domain:
+        yield domain
+
+
+@pytest.fixture(scope="module")
+def running(ros_domain, eventually, tmp_path_factory):
+    """Start the plant and four controllers, and drive."""
+    folder = tmp_path_factory.mktemp("robot")
+    gains = folder / "start.yaml"
     tree = yaml.safe_load((ROOT / "config" / "gains.yaml").read_text())
     for node in tree.values():
         # A machine that runs tests pauses at times: hold the voltage over a pause, so that only
         # the tested code can stop a wheel.
-        node["ros__parameters"].update(
-            p=1.0, i=15.0, d=0.0, feedback_timeout=2.0, setpoint_timeout=2.0
-        )
+        node["ros__parameters"].update(**GAINS, feedback_timeout=2.0, setpoint_timeout=2.0)
     gains.write_text(yaml.safe_dump(tree))
     plant = ("-p", f"motors_file:={MOTORS}", "-p", "command_timeout:=2.0")
-    started = [process("motor_plant", "--ros-args", *plant)]
     ros = ("--ros-args", "--params-file", gains)
-    pids = {w: process("wheel_pid", *ros, "-r", f"__ns:=/{w}") for w in WHEELS}
-    started.extend(pids.values())
-    rclpy.init()
-    one = Robot()
-    one.processes = pids
-    try:
-        eventually(one.at_speed, deadline=30.0, message="\n".join(p.output for p in started))
-        yield one
-    finally:
-        one.close()
-        rclpy.shutdown()
+    with processes(folder) as process:
+        started = [process("motor_plant", "--ros-args", *plant)]
+        pids = {w: process("wheel_pid", *ros, "-r", f"__ns:=/{w}") for w in WHEELS}
+        started.extend(pids.values())
+        rclpy.init()
+        one = Robot()
+        one.processes = pids
+        try:
+            eventually(one.at_speed, 30.0, message="\n".join(p.output for p in started))
+            yield one
+        finally:
+            one.close()
+            rclpy.shutdown()
+
+
+@pytest.fixture
+def robot(running, eventually):
+    """Return the running robot with the gains that it started with."""
+    for wheel, process in running.processes.items():
+        process.send_signal(signal.SIGCONT)
+        running.set_gains(wheel)
+    eventually(running.at_speed, deadline=30.0, message="does not drive")
+    return running
+
+
+TUNE = (sys.executable, "-m", "smp_motor_ident.cli.tune")
 
 
 def run_tune(process, *arguments):
-    tune = process(sys.executable, "-m", "smp_motor_ident.cli.tune", *arguments)
+    tune = process(*TUNE, *arguments)
     return tune.wait(150.0), tune.output
 
 
-def test_apply_changes_four_running_wheels_without_a_stop(process, robot, tmp_path):
-    # Design first, so that the load of designing does not disturb the wheels during the change.
-    # A machine that runs tests responds late at times: design gains for 20 ms.
-    gains = tmp_path / "good.yaml"
-    options = ("--delay", "0.02", "--speed-source", "measured", "--output", gains)
-    code, output = run_tune(process, MOTORS, *options)
-    assert code == 0, output
-    begin = time.monotonic()
-    code, output = run_tune(process, "--gains", gains, "--apply")
-    end = time.monotonic()
-    assert code == 0, output
-    assert "kept" in output
-    assert "1 -> " in output  # the difference was shown: p was 1
+def write_gains(path: Path, gains: dict[str, float]) -> None:
+    tree = {f"/{wheel}/wheel_pid": {"ros__parameters": gains} for wheel in WHEELS}
+    path.write_text(yaml.safe_dump(tree))
+
+
+def begin_trial(process, robot, eventually, folder, seconds):
+    """Apply other gains, and return the tool that watches them."""
+    write_gains(folder / "other.yaml", {"p": 1.1})
+    tune = process(*TUNE, "--gains", folder / "other.yaml", "--apply", "--watch", seconds)
     for wheel in WHEELS:
-        wanted = yaml.safe_load(gains.read_text())[f"/**/{wheel}/wheel_pid"]["ros__parameters"]
-        assert wanted["p"] != 1.0
-        assert robot.gain(wheel) == wanted["p"]
-    # A stop would show as standstill; a bumpless change leaves the speed within the noise of
-    # counts and the settling of the new loop, for which 20 % is generous.
-    assert robot.slowest(begin, end) > 0.8 * SPEED
+        eventually(lambda wheel=wheel: robot.gain(wheel) == 1.1, 60.0, message=tune.output)
+    return tune
 
 
 BAD = ({"p": 400.0, "i": 4000.0}, {"p": -2.0, "i": -40.0}, {"d": 5.0})
@@ -163,8 +193,7 @@ BAD = ({"p": 400.0, "i": 4000.0}, {"p": -2.0, "i": -40.0}, {"d": 5.0})
 def test_bad_gains_are_taken_back_within_two_seconds(process, robot, eventually, tmp_path):
     gains = tmp_path / "bad.yaml"
     for bad in BAD:
-        tree = {f"/{wheel}/wheel_pid": {"ros__parameters": bad} for wheel in WHEELS}
-        gains.write_text(yaml.safe_dump(tree))
+        write_gains(gains, bad)
         code, output = run_tune(process, "--gains", gains, "--apply")
         assert code == 1, output
         taken = output[output.index("restored the old gains after") :].split()
@@ -179,13 +208,7 @@ def test_bad_gains_are_taken_back_within_two_seconds(process, robot, eventually,
 def test_a_wheel_that_stops_in_the_trial_is_settled_when_it_returns(
     process, robot, eventually, tmp_path
 ):
-    gains = tmp_path / "other.yaml"
-    tree = {f"/{wheel}/wheel_pid": {"ros__parameters": {"p": 1.1}} for wheel in WHEELS}
-    gains.write_text(yaml.safe_dump(tree))
-    tune = process(
-        sys.executable, "-m", "smp_motor_ident.cli.tune", "--gains", gains, "--apply", "--watch", 20
-    )
-    eventually(lambda: robot.gain("front_left") == 1.1, deadline=60.0, message=tune.output)
+    tune = begin_trial(process, robot, eventually, tmp_path, seconds=20)
     robot.processes["rear_left"].send_signal(signal.SIGSTOP)
     eventually(lambda: "rear_left does not answer" in tune.output, 30.0, message=tune.output)
     robot.processes["rear_left"].send_signal(signal.SIGCONT)
@@ -195,20 +218,15 @@ def test_a_wheel_that_stops_in_the_trial_is_settled_when_it_returns(
 
 
 def test_a_killed_tool_leaves_the_gains_as_they_were(process, robot, eventually, tmp_path):
-    gains = tmp_path / "other.yaml"
-    tree = {f"/{wheel}/wheel_pid": {"ros__parameters": {"p": 1.1}} for wheel in WHEELS}
-    gains.write_text(yaml.safe_dump(tree))
-    tune = process(
-        sys.executable, "-m", "smp_motor_ident.cli.tune", "--gains", gains, "--apply", "--watch", 60
-    )
-    eventually(lambda: robot.gain("rear_right") == 1.1, deadline=60.0, message=tune.output)
+    tune = begin_trial(process, robot, eventually, tmp_path, seconds=60)
     tune.send_signal(signal.SIGKILL)
     for wheel in WHEELS:
         eventually(lambda wheel=wheel: robot.gain(wheel) == 1.0, deadline=10.0, message=wheel)
 
 
-def test_apply_without_running_wheels_is_refused(process, ros_domain):
-    code, output = run_tune(process, "--gains", ROOT / "config" / "gains.yaml", "--apply")
+def test_apply_without_running_wheels_is_refused(process):
+    with own_domain():
+        code, output = run_tune(process, "--gains", ROOT / "config" / "gains.yaml", "--apply")
     assert code == 1
     assert "is wheel_pid running?" in output
     assert "Traceback" not in output
@@ -243,3 +261,25 @@ def test_relay_on_a_running_wheel_gives_gains_without_a_model(process, robot, ev
     assert period_with(m, 2 * PERIOD) / 1.15 < period < period_with(m, 0.2)
     # The controller has the wheel again.
     eventually(robot.at_speed, deadline=20.0, message="did not drive on")
+
+
+def test_apply_changes_four_running_wheels_without_a_stop(process, robot, tmp_path):
+    # Design first, so that the load of designing does not disturb the wheels during the change.
+    # A machine that runs tests responds late at times: design gains for 20 ms.
+    gains = tmp_path / "good.yaml"
+    options = ("--delay", "0.02", "--speed-source", "measured", "--output", gains)
+    code, output = run_tune(process, MOTORS, *options)
+    assert code == 0, output
+    begin = time.monotonic()
+    code, output = run_tune(process, "--gains", gains, "--apply")
+    end = time.monotonic()
+    assert code == 0, output
+    assert "kept" in output
+    assert "1 -> " in output  # the difference was shown: p was 1
+    for wheel in WHEELS:
+        wanted = yaml.safe_load(gains.read_text())[f"/**/{wheel}/wheel_pid"]["ros__parameters"]
+        assert wanted["p"] != 1.0
+        assert robot.gain(wheel) == wanted["p"]
+    # A stop would show as standstill; a bumpless change leaves the speed within the noise of
+    # counts and the settling of the new loop, for which 20 % is generous.
+    assert robot.slowest(begin, end) > 0.8 * SPEED
