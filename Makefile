@@ -13,15 +13,16 @@ demo: setup
 	@$(IN) exec demo $(ARGS)
 
 # Everything runs on two cores but what is marked as alone: it tells less on a machine that is busy.
-SHARED := python -m pytest -n 2 --dist loadfile
+# Tests of live nodes stay together by file, the longest files first.
+SHARED := python -m pytest -n 2
 test: setup
 ifdef ARGS
 	@$(IN) exec python -m pytest $(ARGS)
 else
 	@$(IN) failed=0; \
-	$(SHARED) --durations=10 --ignore=test/nodes --ignore=test/system || failed=1; \
+	$(SHARED) --dist worksteal --durations=10 --ignore=test/nodes --ignore=test/system || failed=1; \
 	python -m pytest --durations=5 -m alone test/system || failed=1; \
-	$(SHARED) --no-loadscope-reorder --durations=20 -m 'not long and not alone' test/nodes test/system && exit $$failed
+	$(SHARED) --dist loadfile --no-loadscope-reorder --durations=20 -m 'not long and not alone' test/system test/nodes && exit $$failed
 endif
 
 check: setup

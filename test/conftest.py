@@ -1,6 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Fixtures for every test: a ROS domain of its own, and real processes that cannot outlive it."""
 
+# Imported before numpy: as the executables do, tests leave linear algebra one thread.
+import smp_motor_control.entry  # noqa: F401
+
+# isort: split
 import os
 import signal
 import time
@@ -11,9 +15,6 @@ import hypothesis
 import pytest
 from processes import BUSY, TestProcess, own_domain, processes
 from wheel_robot import WheelRobot
-
-# Imported before numpy: as the executables do, tests leave linear algebra one thread.
-import smp_motor_control.entry  # noqa: F401
 
 # Examples are drawn alike in every run, and may take their time on a busy machine.
 hypothesis.settings.register_profile("suite", derandomize=True, deadline=None)

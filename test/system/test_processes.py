@@ -4,6 +4,8 @@
 import os
 from pathlib import Path
 
+from threadpoolctl import threadpool_info
+
 
 def is_running(pid: int) -> bool:
     try:
@@ -29,3 +31,7 @@ def test_each_process_inherits_a_domain_of_its_own_on_loopback(process, ros_doma
     domain, profile = shown.output.split()
     assert (domain, Path(profile).name) == (str(ros_domain), "loopback.xml")
     assert os.environ["ROS_DOMAIN_ID"] == str(ros_domain)
+
+
+def test_linear_algebra_of_tests_has_one_thread():
+    assert {pool["num_threads"] for pool in threadpool_info()} == {1}
