@@ -149,35 +149,6 @@ def test_feedback_faults_stop_the_wheel_are_named_and_driving_resumes(process, r
     assert campaign.wheel.returncode is None and campaign.plant.returncode is None
 
 
-@pytest.mark.slow
-def test_set_points_that_cease_are_nonsense_or_stale_stop_the_wheel(process, robot, eventually):
-    campaign = Campaign(process, robot, eventually)
-    since = time.monotonic()
-    robot.setpoint = None
-    campaign.names("set-point timed out", since)
-    campaign.stops()
-
-    for nonsense in (math.nan, math.inf, -math.inf, 1.8e308 / 2):
-        robot.setpoint = nonsense
-        robot.spin_for(0.4)
-        assert abs(true_speed(robot)) < 0.03, f"turned on a set-point of {nonsense}"
-    campaign.names("set-point that is not a number", since)
-    stale = JointState(name=[f"{WHEEL}_wheel_joint"], velocity=[SPEED])
-    stale.header.stamp.sec = int(time.time()) - 10
-    robot.setpoint = None
-    for _ in range(20):
-        robot.setpoints.publish(stale)
-        robot.spin_for(0.02)
-    assert abs(true_speed(robot)) < 0.03
-    campaign.names("set-point older than its time-out", since)
-    robot.setpoint = SPEED
-    campaign.drives()
-
-    for nonsense in ({"p": math.nan}, {"i": math.inf}, {"p": "x"}, {"setpoint_timeout": 0.0}):
-        assert not robot.set(NODE, **nonsense)[0]
-    campaign.drives()
-
-
 def extreme(draw: random.Random) -> float:
     """Return a number that a driver should never send, or one that it might."""
     return draw.choice(

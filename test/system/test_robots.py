@@ -1,15 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """Several robots: every executable in the robot's namespace, wheels one level below."""
 
-import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import rclpy
+from domain_node import DomainNode
 from geometry_msgs.msg import TwistStamped
 from nav_msgs.msg import Odometry
-from rclpy.executors import SingleThreadedExecutor
 from wheel_robot import two_wheeled
 
 from smp_motor_control import WHEELS
@@ -32,16 +30,15 @@ def begin(process: Process, robot: str, sides: tuple[str, str], motors: Path, ga
     process("skid_steer", "--ros-args", *options)
 
 
-def test_two_robots_with_two_and_four_wheels_drive_independently(process, tmp_path, ros_domain):
+def test_two_robots_with_two_and_four_wheels_drive_independently(
+    process, eventually, tmp_path, ros_domain
+):
     begin(process, "robot1", ("left", "right"), *two_wheeled(tmp_path))
     lefts, rights = " ".join(WHEELS[::2]), " ".join(WHEELS[1::2])
     config = ROOT / "config"
     begin(process, "robot2", (lefts, rights), config / "motors_paper.yaml", config / "gains.yaml")
-    context = rclpy.Context()
-    rclpy.init(args=[], context=context, domain_id=ros_domain)
-    node = rclpy.create_node("driver", context=context)
-    executor = SingleThreadedExecutor(context=context)
-    executor.add_node(node)
+    driver = DomainNode(ros_domain, "driver")
+    node = driver.node
     seen: dict[str, list[Odometry]] = {robot: [] for robot in SPEEDS}
     senders = {}
     for robot, kept in seen.items():
@@ -54,17 +51,15 @@ def test_two_robots_with_two_and_four_wheels_drive_independently(process, tmp_pa
             for robot, speed in SPEEDS.items()
         )
 
-    end = time.monotonic() + 60.0
-    while time.monotonic() < end and not settled():
+    def drive() -> None:
         for robot, speed in SPEEDS.items():
             message = TwistStamped()
             message.header.stamp = node.get_clock().now().to_msg()
             message.twist.linear.x = speed
             senders[robot].publish(message)
-        executor.spin_once(timeout_sec=0.02)
-    assert settled(), {r: m[-1].twist.twist.linear.x for r, m in seen.items() if m}
+        driver.spin_for(0.02)
+
+    eventually(settled, 60.0, drive)
     last = seen["robot1"][-1]
     assert (last.header.frame_id, last.child_frame_id) == ("robot1/odom", "robot1/base_link")
-    executor.shutdown()
-    node.destroy_node()
-    rclpy.shutdown(context=context)
+    driver.close()
