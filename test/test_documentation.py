@@ -22,7 +22,7 @@ import pytest
 import rclpy
 import yaml
 from printed import agree, not_printed
-from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+from recordings import COUNTS, RATIO, START, Motion, floats, in_order, joint_state
 
 from smp_motor_control import WHEELS
 from smp_motor_control.motor import Motor
@@ -138,7 +138,7 @@ def known(node: str) -> set[str]:
 
 # The recordings that the pages speak of.
 
-STEP, RATIO, COUNTS = 0.01, 65.5, 500.0
+STEP = 0.01
 PARTS, WINDOW = 5, 16
 """Steps of 2 ms; one log's speed is averaged over 32 ms."""
 SENSOR = 0.005
@@ -165,53 +165,23 @@ def motion(seed: int, seconds: float = 12.0) -> SimpleNamespace:
     )
 
 
-def store():
-    types = get_typestore(Stores.ROS2_JAZZY)
-    for name in ("MotorState", "MotorDescription"):
-        text = (ROOT / f"smp_interfaces/msg/{name}.msg").read_text()
-        types.register(get_types_from_msg(text, f"smp_interfaces/msg/{name}"))
-    return types
-
-
 def write_bag(path: Path, one: SimpleNamespace, own: bool, current: bool = False) -> None:
     """Write our messages, or PWM and joint states as other robots have them."""
-    amps = one.i if current else np.full(one.t.size, math.nan)
-    types = store()
-
-    def put(bag: BagWriter, topic: str, kind: str, seconds: float, **fields: object) -> None:
-        stamp = 1_700_000_000_000_000_000 + round(1e9 * seconds)
-        if "header" in fields:
-            time = types.types["builtin_interfaces/msg/Time"](*divmod(stamp, 1_000_000_000))
-            fields["header"] = types.types["std_msgs/msg/Header"](time, str(fields["header"]))
-        data = types.serialize_cdr(types.types[kind](**fields), kind)
-        bag.write(topic, kind, bytes(data), stamp)
-
-    state, description = "smp_interfaces/msg/MotorState", "smp_interfaces/msg/MotorDescription"
+    stamps = START + np.rint(1e9 * one.t).astype(np.int64)
+    if own:
+        mean = np.concatenate(([0.0], one.u[:-1]))  # over the interval that ends with the sample
+        amps = one.i if current else np.full(one.t.size, math.nan)
+        position = one.count * 2 * math.pi / COUNTS / RATIO
+        state = Motion("front_left", stamps, mean, amps, one.w / RATIO, position, one.count)
+        messages = state.messages(latency=0)
+    else:
+        speeds = [joint_state(t, ["left_wheel_joint"], [w]) for t, w in zip(stamps, one.w)]
+        messages = in_order(speeds, floats("/pwm", stamps, one.u * 255 / 12))
     with BagWriter(path) as bag:
-        topics = (
-            {"/front_left/motor_state": state, "/front_left/motor_description": description}
-            if own
-            else {"/pwm": "std_msgs/msg/Float64", "/joint_states": "sensor_msgs/msg/JointState"}
-        )
-        for topic, kind in topics.items():
+        for topic, kind in dict.fromkeys((sent.topic, sent.type) for sent in messages):
             bag.add_topic(topic, kind)
-        if own:
-            put(bag, "/front_left/motor_description", description, 0.0,
-                joint_name="front_left_wheel_joint", gear_ratio=RATIO, counts_per_revolution=COUNTS,
-                encoder_bits=0, supply_voltage=12.0, resistance=math.nan)  # fmt: skip
-        before = 0.0
-        for t, u, i, count, w in zip(one.t, one.u, amps, one.count, one.w, strict=True):
-            if own:
-                put(bag, "/front_left/motor_state", state, t, header="front_left_wheel_joint",
-                    voltage=before, current=float(i), velocity=w / RATIO,
-                    position=count * 2 * math.pi / COUNTS / RATIO, encoder_count=int(count),
-                    duty_cycle=0.0)  # fmt: skip
-                before = float(u)
-            else:
-                put(bag, "/joint_states", topics["/joint_states"], t, header="",
-                    name=["left_wheel_joint"], position=np.zeros(0), velocity=np.array([w]),
-                    effort=np.zeros(0))  # fmt: skip
-                put(bag, "/pwm", topics["/pwm"], t, data=u * 255 / 12)
+        for sent in messages:
+            bag.write(sent.topic, sent.type, sent.data, sent.stamp)
 
 
 def driven_by_pid_v1(seconds: float) -> np.ndarray:

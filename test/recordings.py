@@ -17,7 +17,7 @@ from scipy.signal import cont2discrete, lfilter
 from smp_motor_ident.bag import read_records
 from smp_motor_ident.record import Record
 
-ROOT = Path(__file__).resolve().parents[2]
+ROOT = Path(__file__).resolve().parents[1]
 STATE = "smp_interfaces/msg/MotorState"
 DESCRIPTION = "smp_interfaces/msg/MotorDescription"
 START = 1_700_000_000_000_000_000
