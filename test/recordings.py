@@ -14,7 +14,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 from scipy.signal import cont2discrete, lfilter
 
-from smp_motor_ident.bag import read_records
+from smp_motor_ident.bag import BagWriter, read_records
 from smp_motor_ident.record import Record
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -198,6 +198,13 @@ def write_mcap(
         if finish:
             writer.finish()
     return path
+
+
+def write_bag(path: Path, messages: Iterable[Sent]) -> None:
+    """Write the folder of a bag as ``record`` does."""
+    with BagWriter(path) as bag:
+        for sent in messages:
+            bag.write(sent.topic, sent.type, sent.data, sent.stamp)
 
 
 TOPIC_COLUMNS = {

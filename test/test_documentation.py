@@ -20,6 +20,7 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 import rclpy
+import recordings
 import yaml
 from printed import agree, not_printed
 from recordings import COUNTS, RATIO, START, Motion, floats, in_order, joint_state
@@ -29,7 +30,6 @@ from smp_motor_control.motor import Motor
 from smp_motor_control.motor.file import load_motors
 from smp_motor_control.ros_arguments import split_arguments
 from smp_motor_control.serial_protocol import decode_state, encode_age, encode_voltages
-from smp_motor_ident.bag.writer import BagWriter
 from smp_motor_ident.cli import commission, demo, identify, lab, tune
 from smp_motor_ident.nodes import play, record
 
@@ -173,15 +173,11 @@ def write_bag(path: Path, one: SimpleNamespace, own: bool, current: bool = False
         amps = one.i if current else np.full(one.t.size, math.nan)
         position = one.count * 2 * math.pi / COUNTS / RATIO
         state = Motion("front_left", stamps, mean, amps, one.w / RATIO, position, one.count)
-        messages = state.messages(latency=0)
+        recordings.write_bag(path, state.messages(latency=0))
     else:
         speeds = [joint_state(t, ["left_wheel_joint"], [w]) for t, w in zip(stamps, one.w)]
-        messages = in_order(speeds, floats("/pwm", stamps, one.u * 255 / 12))
-    with BagWriter(path) as bag:
-        for topic, kind in dict.fromkeys((sent.topic, sent.type) for sent in messages):
-            bag.add_topic(topic, kind)
-        for sent in messages:
-            bag.write(sent.topic, sent.type, sent.data, sent.stamp)
+        duties = floats("/pwm", stamps, one.u * 255 / 12)
+        recordings.write_bag(path, in_order(speeds, duties))
 
 
 def driven_by_pid_v1(seconds: float) -> np.ndarray:

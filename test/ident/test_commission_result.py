@@ -12,11 +12,9 @@ import pytest
 import yaml
 from client import Client
 from motors import record
-from rclpy.serialization import serialize_message
+from recordings import COUNTS, RATIO, START, Motion, write_bag
 
-from smp_interfaces.msg import MotorDescription, MotorState
 from smp_motor_control.excitation import SIGNALS
-from smp_motor_ident.bag import BagWriter
 from smp_motor_ident.cli import checking, commissioning, steps
 from smp_motor_ident.cli.commission import main
 from smp_motor_ident.commission.wheel_test import Figures
@@ -67,30 +65,10 @@ class Robot:
 
 def write(folder: Path, did: Record) -> None:
     """Write a record as ``record`` records it."""
-    begin = 1_700_000_000_000_000_000
-    with BagWriter(folder) as bag:
-        hardware = did.hardware
-        described = MotorDescription(
-            joint_name=f"{WHEEL}_wheel_joint", gear_ratio=hardware.gear_ratio,
-            counts_per_revolution=hardware.counts_per_revolution, encoder_bits=0,
-            supply_voltage=12.0, resistance=math.nan,
-        )  # fmt: skip
-        put(bag, "motor_description", described, begin)
-        turn = 2 * math.pi / 500.0 / hardware.gear_ratio
-        for k, seconds in enumerate(did.time):
-            state = MotorState(voltage=float(did.voltage[k]), current=float(did.current[k]))
-            state.velocity = float(did.velocity[k]) / hardware.gear_ratio
-            state.encoder_count = int(did.count[k])
-            state.position = float(did.count[k]) * turn
-            stamp = begin + round(1e9 * float(seconds))
-            state.header.stamp.sec, state.header.stamp.nanosec = divmod(stamp, 10**9)
-            put(bag, "motor_state", state, stamp)
-
-
-def put(bag: BagWriter, topic: str, message: Any, stamp: int) -> None:
-    kind = f"smp_interfaces/msg/{type(message).__name__}"
-    data = bytes(serialize_message(message))
-    bag.write(f"/{WHEEL}/{topic}", kind, data + bytes(-len(data) % 4), stamp)
+    stamps = START + np.rint(1e9 * did.time).astype(np.int64)
+    position = did.count * 2 * math.pi / COUNTS / RATIO
+    signals = did.voltage, did.current, did.velocity / RATIO, position, did.count
+    write_bag(folder, Motion(WHEEL, stamps, *signals).messages(latency=0))
 
 
 def numbers(folder: Path) -> dict[str, Any]:

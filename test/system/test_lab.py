@@ -295,7 +295,7 @@ def test_strangers_stay_outside_and_one_page_drives(two_wheels, eventually):
 def test_a_server_of_all_interfaces_warns_and_prints_an_address_that_opens(
     process, eventually, ros_domain, host, own
 ):
-    demo = ("--demo", "--domain", str(ros_domain), "--rate", "100")
+    demo = ("--demo", "--domain", str(ros_domain))
     lab = process("lab", "--no-browser", "--host", host, *demo)
     url = address(lab, eventually)
     assert f"WARNING: served on {host}" in lab.output

@@ -17,11 +17,12 @@ from recordings import (
     motion,
     notes,
     read,
+    write_bag,
     write_mcap,
     write_sqlite,
 )
 
-from smp_motor_ident.bag import BagWriter, join_records, read_records
+from smp_motor_ident.bag import join_records, read_records
 from smp_motor_ident.bag.clock import average_held_input, fit_clock
 from smp_motor_ident.errors import BagError
 
@@ -35,7 +36,8 @@ MANY = settings(max_examples=25, deadline=None, suppress_health_check=list(Healt
 def test_any_sequence_of_states_reads_back_as_it_was_written(tmp_path_factory, data):
     n = data.draw(st.integers(2, 60))
     finite = st.floats(-1e12, 1e12)
-    column = st.lists(finite, min_size=n, max_size=n).map(np.array)
+    # A speed of zero throughout, while the counts go on, was never filled in, and is left out.
+    column = st.lists(finite, min_size=n, max_size=n).map(np.array).filter(np.any)
     # Any intervals between half and one and a half of each other: no gap, no loss.
     steps = data.draw(st.lists(st.integers(8_000_000, 12_000_000), min_size=n, max_size=n))
     # A counter that stays at an end of its range is full, and refused.
@@ -49,9 +51,7 @@ def test_any_sequence_of_states_reads_back_as_it_was_written(tmp_path_factory, d
         count=np.array(counts, np.int64),
     )
     bag = tmp_path_factory.mktemp("bag") / "bag"
-    with BagWriter(bag) as writer:
-        for sent in truth.messages():
-            writer.write(sent.topic, sent.type, sent.data, sent.stamp)
+    write_bag(bag, truth.messages())
     assert_read(read_records(bag)["rear_right"], truth)
 
 
