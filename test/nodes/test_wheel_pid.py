@@ -9,6 +9,7 @@ import sys
 import time
 
 import pytest
+from sensor_msgs.msg import JointState
 from wheel_robot import WheelRobot
 
 WHEEL = "front_left"
@@ -78,10 +79,16 @@ def test_one_pid_step_per_sample_with_dt_from_the_stamps(start, robot, eventuall
         robot.send_setpoint(nonsense)
         robot.spin_for(0.05)
         assert feed.sample(0.0) == 0.0, f"moved on a set-point of {nonsense}"
+    stale = JointState(name=[f"{WHEEL}_wheel_joint"], velocity=[1.0])
+    stale.header.stamp.sec = int(time.time()) - 60
+    robot.setpoints.publish(stale)
+    robot.spin_for(0.05)
+    assert feed.sample(0.0) == 0.0, "moved on a set-point older than its time-out"
     robot.send_setpoint(1.0, wheels=("rear_left",))
     robot.spin_for(0.05)
     assert feed.sample(0.0) == 0.0, "moved on another wheel's set-point"
-    eventually(lambda: robot.named(NODE, "set-point that is not a number"), 3.0, robot.spin)
+    for words in ("set-point that is not a number", "set-point older than its time-out"):
+        eventually(lambda words=words: robot.named(NODE, words), 3.0, robot.spin, words)
 
     robot.send_setpoint(1.0)
     eventually(lambda: feed.sample(0.0) != 0.0, 3.0)
