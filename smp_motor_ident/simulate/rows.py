@@ -18,7 +18,7 @@ LENGTH_TOLERANCE = 1e-9  # relative, of equal lengths
 
 @dataclass(frozen=True, eq=False)
 class Pieces:
-    """Intervals of constant input, row by row; see `simulate.kernel.run`."""
+    """Intervals of constant input, row by row; see `simulate.kernel.simulate_rows`."""
 
     first: Integers  # shape (n + 1,)
     length: Array
