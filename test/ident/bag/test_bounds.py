@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Damaged and hostile files: bounded memory, one line, no traceback."""
+"""Damaged and hostile files are read or refused in one line, within bounded memory."""
 
 import random
 import resource
@@ -24,7 +24,7 @@ FUZZ = load("fuzz")
 
 
 @pytest.mark.parametrize("name", list(FUZZ.SEEDS))
-def test_a_sound_file_of_every_format_is_an_answer(tmp_path, name):
+def test_intact_file_of_every_format_is_read(tmp_path, name):
     FUZZ.SOUND.update({key: FUZZ.SEEDS[key][1]() for key in {name, "mcap", "sqlite"}})
     assert FUZZ.outcome(name, FUZZ.SOUND[name], tmp_path) == "answer"
 
@@ -32,31 +32,31 @@ def test_a_sound_file_of_every_format_is_an_answer(tmp_path, name):
 @pytest.mark.parametrize("name", list(FUZZ.SEEDS))
 @settings(
     max_examples=6,
-    derandomize=True,  # benchmarks/fuzz.py draws others
+    derandomize=True,  # benchmarks/fuzz.py uses other seeds
     deadline=30_000,  # ms, as benchmarks/fuzz.py: a MATLAB file starts two processes of scipy
     phases=[Phase.generate],
     suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow],
 )
 @given(seed=st.integers(0, 2**32))
-def test_a_spoilt_file_gives_an_answer_or_one_line(tmp_path, name, seed):
+def test_corrupted_file_is_read_or_refused_in_one_line(tmp_path, name, seed):
     if name not in FUZZ.SOUND:
         FUZZ.SOUND.update({key: FUZZ.SEEDS[key][1]() for key in {name, "mcap", "sqlite"}})
     spoilt = FUZZ.spoil(FUZZ.SOUND[name], random.Random(seed))
     assert FUZZ.outcome(name, spoilt, tmp_path) in ("answer", "partial", "refused")
 
 
-def test_a_message_that_quotes_a_spoilt_name_is_one_line():
+def test_control_characters_in_error_message_are_replaced():
     assert str(BagError("has /joint_sta\nes\x1b[2J")) == "has /joint_sta\ufffdes\ufffd[2J"
 
 
-def test_a_message_that_quotes_a_spoilt_value_keeps_head_and_tail():
+def test_long_error_message_is_shortened_in_the_middle():
     long = BagError(f"a.yaml: left: {'- ' * 3000}is not SOURCE")
     assert len(str(long)) < 1100
     assert str(long).startswith("a.yaml: left: -") and str(long).endswith("- is not SOURCE")
     assert str(BagError("a.yaml: " + 900 * "x")) == "a.yaml: " + 900 * "x"
 
 
-def test_a_file_that_kills_the_matlab_reader_is_refused(tmp_path, monkeypatch):
+def test_matlab_file_that_crashes_its_reader_is_refused(tmp_path, monkeypatch):
     path = tmp_path / "a.mat"
     path.write_bytes(FUZZ.SEEDS["mat"][1]())
     reader = tmp_path / "reader.py"
@@ -67,7 +67,7 @@ def test_a_file_that_kills_the_matlab_reader_is_refused(tmp_path, monkeypatch):
 
 
 def bomb(kind: str, size: int) -> bytes:
-    """Return a compressed MCAP file of zeros behind its magic."""
+    """Return a compressed MCAP file of zeros after its magic bytes."""
     head = b"\x89MCAP0\r\n"
     if kind == "lz4":
         return lz4.frame.compress(head + bytes(size), store_size=True)
@@ -75,10 +75,10 @@ def bomb(kind: str, size: int) -> bytes:
 
 
 @pytest.mark.parametrize("kind", ["zstd", "lz4"])
-def test_a_bomb_is_refused_within_bounded_memory(tmp_path, kind):
+def test_decompression_bomb_is_refused_within_bounded_memory(tmp_path, kind):
     path = tmp_path / f"bag.mcap.{kind}"
     path.write_bytes(bomb(kind, 400_000_000))
-    # VmHWM starts anew with a process; ru_maxrss includes the parent's peak.
+    # VmHWM starts at zero in each process; ru_maxrss includes the parent's peak.
     code = (
         "import re, sys\n"
         "from pathlib import Path\n"
@@ -98,7 +98,7 @@ def test_a_bomb_is_refused_within_bounded_memory(tmp_path, kind):
     assert int(kilobytes) < 100_000  # unpacked on disk, a piece at a time
 
 
-def test_the_limit_can_be_raised_and_lowered(tmp_path, monkeypatch):
+def test_decompression_limit_is_set_by_environment_variable(tmp_path, monkeypatch):
     truth = motion()
     plain = write_mcap(tmp_path / "plain.mcap", truth.messages())
     path = tmp_path / "bag.mcap.zstd"
@@ -113,9 +113,9 @@ def test_the_limit_can_be_raised_and_lowered(tmp_path, monkeypatch):
         read_records(path)
 
 
-def test_an_lz4_frame_that_lies_about_its_size_takes_no_memory(tmp_path):
+def test_lz4_frame_with_false_size_allocates_no_memory(tmp_path):
     frame = bytearray(lz4.frame.compress(b"\x89MCAP0\r\n" + bytes(1000), store_size=True))
-    frame[6:14] = (4_400_000_000).to_bytes(8, "little")  # the checksum of the head fails, too
+    frame[6:14] = (4_400_000_000).to_bytes(8, "little")  # the header's checksum fails as well
     path = tmp_path / "bag.mcap.lz4"
     path.write_bytes(bytes(frame))
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
@@ -124,7 +124,7 @@ def test_an_lz4_frame_that_lies_about_its_size_takes_no_memory(tmp_path):
     assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 100_000  # kB
 
 
-def test_the_second_frame_of_a_compressed_chunk_is_read(tmp_path, monkeypatch):
+def test_second_frame_of_compressed_chunk_is_read(tmp_path, monkeypatch):
     import mcap.writer
 
     once = zstd.compress

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""CSV files of different software with the same mapping."""
+"""CSV files of different software are read with the same mapping."""
 
 import re
 from collections.abc import Sequence
@@ -80,7 +80,7 @@ STATED = [
 
 
 @pytest.mark.parametrize(("text", "mapping", "stated"), STATED)
-def test_a_table_is_read_as_it_states(tmp_path, text, mapping, stated):
+def test_csv_dialects_units_and_time_formats_are_read(tmp_path, text, mapping, stated):
     path = tmp_path / "log.csv"
     path.write_bytes(text)
     record = read_records(path, [mapping])["motor"]
@@ -88,7 +88,7 @@ def test_a_table_is_read_as_it_states(tmp_path, text, mapping, stated):
     np.testing.assert_allclose(record.time, stated["time"], atol=1e-9)
     np.testing.assert_allclose(np.diff(record.time), np.diff(stated["time"]))
     np.testing.assert_allclose(record.velocity, stated["velocity"])
-    # Applied from its row on: the mean over the interval that ends at a row is the one before.
+    # A command holds from its row on: the interval that ends at a row has the previous one.
     np.testing.assert_allclose(record.voltage[1:], stated["voltage"][:-1])
     strays = "stray_rows" in [f.code for f in record.findings]
     assert strays or b"Acceleration" not in text
@@ -108,7 +108,7 @@ def test_a_table_is_read_as_it_states(tmp_path, text, mapping, stated):
         ("# a,b,c\nt,u,y", ",", ["t", "u", "y"]),
     ],
 )  # fmt: skip
-def test_a_comment_right_above_the_numbers_may_name_the_columns(tmp_path, above, separator, names):
+def test_column_names_are_read_from_comment_above_the_data(tmp_path, above, separator, names):
     path = tmp_path / "log.csv"
     path.write_text(above + "\n" + table(separator).partition("\n")[2])
     listing = list_topics(path)[0]
@@ -126,12 +126,12 @@ def test_a_comment_right_above_the_numbers_may_name_the_columns(tmp_path, above,
         ("Time Commanded Pos Encoder 1", ["c1", "c2", "c3"]),
     ],
 )
-def test_names_of_several_words_are_not_shifted(tmp_path, head, names):
+def test_column_names_of_several_words_stay_aligned(tmp_path, head, names):
     (tmp_path / "log.txt").write_text(head + "\n" + table(" ").partition("\n")[2])
     assert list_topics(tmp_path / "log.txt")[0].topics[0].fields == names
 
 
-def test_a_voltage_may_have_been_held_up_to_its_row(tmp_path):
+def test_voltage_held_before_its_row_is_read(tmp_path):
     (tmp_path / "log.csv").write_text(table())
     record = read_records(tmp_path / "log.csv", [*MAP, "held=before"])["motor"]
     np.testing.assert_allclose(record.voltage, U)
@@ -139,7 +139,7 @@ def test_a_voltage_may_have_been_held_up_to_its_row(tmp_path):
 
 @pytest.mark.parametrize("output", ["velocity", "position", "count"])
 @pytest.mark.parametrize("lead", [False, True])
-def test_the_motion_tells_whether_a_voltage_held_up_to_its_row(tmp_path, lead, output):
+def test_hold_of_voltage_is_inferred_from_motion(tmp_path, lead, output):
     rng = np.random.default_rng(1)
     volts = np.repeat(rng.uniform(-6, 6, 30), 20)
     speed = follow(np.append(volts[1:], 0.0) if lead else volts)
@@ -158,8 +158,8 @@ def test_the_motion_tells_whether_a_voltage_held_up_to_its_row(tmp_path, lead, o
 
 
 @pytest.mark.parametrize("noise", [0.3, 3.0])
-def test_a_loop_that_answers_its_own_rows_is_not_taken_for_its_motor(tmp_path, noise):
-    """A controller's command answers the row's speed at once; the speed does not answer it."""
+def test_feedback_is_not_mistaken_for_voltage_held_before_its_row(tmp_path, noise):
+    """A controller's command follows the speed of its row; the speed does not follow it."""
     rng = np.random.default_rng(2)
     target = np.repeat(rng.uniform(-100, 100, 30), 20)
     rows, speed, integral = ["t,u,y"], 0.0, 0.0
@@ -184,7 +184,7 @@ def test_empty_cells_are_missing_values(tmp_path):
 
 
 @pytest.mark.parametrize(("step", "unit"), [(20, "ms"), (5180, "us")])
-def test_a_time_without_unit_that_cannot_be_seconds_is_asked_for(tmp_path, step, unit):
+def test_unit_of_time_that_cannot_be_seconds_is_requested(tmp_path, step, unit):
     path = tmp_path / "log.csv"
     path.write_text("\n".join(["tiempo,u,y", *(f"{step * k},{k % 7},{k % 5}" for k in range(99))]))
     with pytest.raises(BagError, match=f"rises by {step} per row.* time=tiempo:ms"):
@@ -194,7 +194,7 @@ def test_a_time_without_unit_that_cannot_be_seconds_is_asked_for(tmp_path, step,
         np.testing.assert_allclose(np.diff(record.time), step * factor)
 
 
-def test_columns_of_words_are_not_in_the_way(tmp_path):
+def test_text_columns_are_ignored(tmp_path):
     rng = np.random.default_rng(8)
     pairs = zip(np.repeat(rng.uniform(-6, 6, 20), 10), np.cumsum(rng.normal(0, 1, 200)))
     rows = [
@@ -209,12 +209,12 @@ def test_columns_of_words_are_not_in_the_way(tmp_path):
         read_records(path, ["voltage=frame velocity=y time=t"])
 
 
-def test_quoted_cells_with_decimal_commas_are_no_quoted_rows(tmp_path):
+def test_quoted_decimal_commas_are_not_quoted_rows(tmp_path):
     (tmp_path / "u.csv").write_text('"u"\n' + "".join(f'"{x:g}"\n'.replace(".", ",") for x in U))
     assert list_topics(tmp_path / "u.csv")[0].topics[0].fields == ["u"]
 
 
-def test_a_time_with_an_offset_brings_two_tables_onto_one_clock(tmp_path):
+def test_time_offset_in_mapping_aligns_two_tables(tmp_path):
     time = np.arange(100) * 0.02
     voltage, late = np.where(time % 0.6 < 0.3, 3.0, -3.0), (0.0, 0.5)
     np.savetxt(tmp_path / "set.csv", np.stack([time, voltage], 1), header="t,u", delimiter=",")
@@ -227,7 +227,7 @@ def test_a_time_with_an_offset_brings_two_tables_onto_one_clock(tmp_path):
     np.testing.assert_array_equal(*(record.voltage for record in records))
 
 
-def test_several_files_are_several_experiments_of_several_motors(tmp_path):
+def test_files_of_two_motors_are_experiments_of_each_motor(tmp_path):
     for name in ("a.csv", "b.csv"):
         (tmp_path / name).write_text(table())
     mapping = ["time=t left.voltage=u left.velocity=y:deg/s right.voltage=y right.velocity=u"]
@@ -235,7 +235,7 @@ def test_several_files_are_several_experiments_of_several_motors(tmp_path):
     assert {wheel: len(records) for wheel, records in found.items()} == {"left": 2, "right": 2}
 
 
-def test_a_column_goes_by_its_name_without_the_unit(tmp_path):
+def test_column_is_found_by_name_without_unit(tmp_path):
     path = tmp_path / "log.csv"
     path.write_text(table(";", ",", "Zeit [ms],Spannung [V],Drehzahl [rpm]"))
     mapping = "voltage=Spannung velocity=Drehzahl time=Zeit"
@@ -276,7 +276,7 @@ def test_unreadable_files_are_refused_with_name_and_reason(tmp_path, text, mappi
 
 
 @pytest.mark.skipif(not DATA.exists(), reason="recordings are not at hand")
-def test_the_recordings_of_real_motors_are_read():
+def test_recordings_of_real_motors_are_read():
     path = DATA / "prbs_gearmotor" / "prbs_2026-08-14.csv"
     record = read_records(path, MAP)["motor"]
     assert len(record) == 4093
@@ -299,7 +299,7 @@ def test_the_recordings_of_real_motors_are_read():
     assert records[0].velocity_window == 0.032
 
 
-def test_labels_of_several_words_have_their_units(tmp_path):
+def test_units_are_read_with_labels_of_several_words(tmp_path):
     rows = [f"PWM percent: {u}%, Motor speed: {y} rpm" for u, y in zip(U, Y)]
     (tmp_path / "log.txt").write_text("\n".join(["connected", *rows]))
     info = list_topics(tmp_path / "log.txt")[0].topics[0]
@@ -307,8 +307,8 @@ def test_labels_of_several_words_have_their_units(tmp_path):
     assert info.units == {"PWM percent [%]": "%", "Motor speed [rpm]": "rpm"}
 
 
-def columns(folder: Path, *names: str) -> list[Path]:
-    """Write a file a column."""
+def write_columns(folder: Path, *names: str) -> list[Path]:
+    """Write one file per column."""
     held = {"t": 0.02 * np.arange(5), "u": U, "y": Y}
     for name in names:
         (folder / f"{name}.txt").write_text("\n".join([name, *map(repr, held[name].tolist())]))
@@ -316,19 +316,19 @@ def columns(folder: Path, *names: str) -> list[Path]:
 
 
 @pytest.mark.parametrize("mapping", [MAP, ["voltage=/u.u velocity=/y.y:deg/s time=/t.t"]])
-def test_a_recording_of_one_column_a_file_is_put_together(tmp_path, mapping):
-    record = read_records(columns(tmp_path, "t", "u", "y"), mapping)["motor"]
+def test_recording_with_one_file_per_column_is_combined(tmp_path, mapping):
+    record = read_records(write_columns(tmp_path, "t", "u", "y"), mapping)["motor"]
     np.testing.assert_allclose(record.velocity, Y * np.pi / 180)
     np.testing.assert_allclose(record.time, 0.02 * np.arange(5))
     given = [
         mapping[0].replace("time=t", "sample_time=0.1").replace("time=/t.t", "sample_time=0.1")
     ]
-    record = read_records(columns(tmp_path, "u", "y"), given)["motor"]
+    record = read_records(write_columns(tmp_path, "u", "y"), given)["motor"]
     np.testing.assert_allclose(record.time, 0.1 * np.arange(5))
 
 
-def test_times_of_another_number_of_rows_are_refused(tmp_path):
-    files = columns(tmp_path, "t", "u", "y")
+def test_time_column_of_different_length_is_refused(tmp_path):
+    files = write_columns(tmp_path, "t", "u", "y")
     files[0].write_text("t\n0\n1\n")
     with pytest.raises(BagError, match=r"has 5 rows, and their time /t\.t has 2"):
         read_records(files, MAP)

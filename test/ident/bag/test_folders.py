@@ -24,7 +24,7 @@ def test_split_bags_are_one_recording(bag, storage, described):
     truth = motion(n=300)
     messages = truth.messages()
     write = write_mcap if storage == "mcap" else write_sqlite
-    # Ten and more: files must not be taken in the order of their letters.
+    # More than ten files: alphabetical order would be wrong.
     parts = [messages[k * 26 : (k + 1) * 26] for k in range(12)]
     files = [write(bag / f"bag_{k}.{storage}", part).name for k, part in enumerate(parts)]
     if described:
@@ -35,7 +35,7 @@ def test_split_bags_are_one_recording(bag, storage, described):
     assert ("metadata.yaml" in notes(record)) is not described
 
 
-def test_a_missing_part_of_a_split_bag_is_told_with_its_messages(bag):
+def test_missing_part_of_split_bag_is_reported_with_lost_messages(bag):
     truth = motion(n=300)
     messages = truth.messages()
     write_mcap(bag / "bag_0.mcap", messages[:101])
@@ -46,7 +46,7 @@ def test_a_missing_part_of_a_split_bag_is_told_with_its_messages(bag):
     assert "100 of 300 messages" in notes(record)
 
 
-def test_a_damaged_part_of_a_split_bag_costs_only_itself(bag):
+def test_damaged_part_of_split_bag_loses_only_its_messages(bag):
     truth = motion(n=300)
     messages = truth.messages()
     write_mcap(bag / "bag_0.mcap", messages[:101])
@@ -60,7 +60,7 @@ def test_a_damaged_part_of_a_split_bag_costs_only_itself(bag):
     assert "200 of 300 messages" in notes(record)
 
 
-def test_a_folder_of_bags_is_a_list_of_experiments(tmp_path):
+def test_bags_in_a_folder_are_separate_experiments(tmp_path):
     truths = [motion(n=50 + k, seed=k) for k in range(3)]
     for k, truth in enumerate(truths):
         bag = tmp_path / f"run{k}"
@@ -75,7 +75,7 @@ def test_a_folder_of_bags_is_a_list_of_experiments(tmp_path):
     assert joined.source == "run0, run1, run2"
 
 
-def test_bare_files_of_different_names_in_a_folder_are_experiments(tmp_path):
+def test_differently_named_files_in_a_folder_are_separate_experiments(tmp_path):
     for name in ("slow.mcap", "fast.mcap"):
         write_mcap(tmp_path / name, motion(n=20).messages())
     assert [r.source for r in read_experiments(tmp_path)["front_left"]] == [
@@ -84,7 +84,7 @@ def test_bare_files_of_different_names_in_a_folder_are_experiments(tmp_path):
     ]
 
 
-def test_fewer_messages_than_the_metadata_count_are_named(tmp_path):
+def test_fewer_messages_than_in_metadata_are_reported(tmp_path):
     truth = motion()
     bag = tmp_path / "bag"
     bag.mkdir()
@@ -94,14 +94,14 @@ def test_fewer_messages_than_the_metadata_count_are_named(tmp_path):
     assert "200 of 1234 messages could be read" in notes(read_records(bag)["front_left"])
 
 
-def test_a_path_that_does_not_exist_and_an_empty_folder_are_refused(tmp_path):
+def test_missing_path_and_empty_folder_are_refused(tmp_path):
     with pytest.raises(BagError, match="does not exist"):
         read_records(tmp_path / "nothing")
     with pytest.raises(BagError, match="holds no bag"):
         read_records(tmp_path)
 
 
-def test_a_folder_of_bags_tells_which_of_them_could_not_be_read(tmp_path):
+def test_unreadable_bag_in_a_folder_is_reported(tmp_path):
     for name in ("good", "bad"):
         (tmp_path / name).mkdir()
         write_mcap(tmp_path / name / "x_0.mcap", motion(n=20).messages())
@@ -115,7 +115,7 @@ def test_a_folder_of_bags_tells_which_of_them_could_not_be_read(tmp_path):
 
 
 @pytest.mark.parametrize("text", ["", ":\n - {", "a: 1", "rosbag2_bagfile_information: 7"])
-def test_damaged_metadata_do_not_hide_the_files(tmp_path, text):
+def test_files_are_read_when_metadata_is_damaged(tmp_path, text):
     truth = motion()
     write_mcap(tmp_path / "x_0.mcap", truth.messages())
     (tmp_path / "metadata.yaml").write_text(text)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Every format a bag may come in, made by other libraries, reads as the same record."""
+"""Bags of every format, written by other libraries, are read as the same record."""
 
 import gc
 import shutil
@@ -37,7 +37,7 @@ PACKERS: dict[str, Pack] = {"plain": bytes, "zstd": zstd.compress, "lz4": lz4.fr
 
 @pytest.mark.parametrize("pack", PACKERS)
 @pytest.mark.parametrize("storage", ["mcap", "db3"])
-def test_messages_compressed_one_by_one_are_read(tmp_path, storage, pack):
+def test_individually_compressed_messages_are_read(tmp_path, storage, pack):
     truth = motion()
     write = write_mcap if storage == "mcap" else write_sqlite
     path = write(tmp_path / f"bag.{storage}", truth.messages(), encode=PACKERS[pack])
@@ -101,7 +101,7 @@ def test_metadata_of_every_version_are_understood(tmp_path, version, storage):
 @pytest.mark.parametrize("plugin", StoragePlugin)
 @pytest.mark.parametrize("mode", CompressionMode)
 @pytest.mark.parametrize("version", [8, 9])
-def test_bags_of_rosbags_are_read(tmp_path, plugin, mode, version):
+def test_bags_written_by_rosbags_are_read(tmp_path, plugin, mode, version):
     if plugin == StoragePlugin.SQLITE3 and mode == CompressionMode.STORAGE:
         pytest.skip("SQLite has no compression of its own")
     truth = motion()
@@ -118,7 +118,7 @@ def test_bags_of_rosbags_are_read(tmp_path, plugin, mode, version):
     assert_read(read_records(tmp_path / "bag")["front_left"], truth)
 
 
-def test_qos_that_disagrees_between_metadata_and_file_hides_nothing(tmp_path):
+def test_messages_are_read_when_qos_of_metadata_and_file_differ(tmp_path):
     truth = motion()
     tmp_path.joinpath("bag").mkdir()
     bag = tmp_path / "bag"
@@ -129,7 +129,7 @@ def test_qos_that_disagrees_between_metadata_and_file_hides_nothing(tmp_path):
     assert_read(read_records(bag)["front_left"], truth)
 
 
-def test_messages_that_only_the_journal_holds_are_read(tmp_path):
+def test_messages_in_sqlite_journal_are_read(tmp_path):
     truth = motion()
     messages = truth.messages()
     path = write_sqlite(tmp_path / "bag.db3", messages[:101])
@@ -149,7 +149,7 @@ def test_messages_that_only_the_journal_holds_are_read(tmp_path):
         shutil.copyfile(tmp_path / name, dead / name)
     database.close()
     before = (dead / "bag.db3").read_bytes()
-    with warnings.catch_warnings(record=True) as left:  # of folders that nobody clears
+    with warnings.catch_warnings(record=True) as left:  # of temporary folders left behind
         warnings.simplefilter("always")
         record = read_records(dead / "bag.db3")["front_left"]
         gc.collect()
@@ -159,7 +159,7 @@ def test_messages_that_only_the_journal_holds_are_read(tmp_path):
     assert (dead / "bag.db3").read_bytes() == before
 
 
-def test_a_message_that_changed_between_distributions_is_read_by_the_fitting_definition(tmp_path):
+def test_message_definition_of_matching_ros_distribution_is_used(tmp_path):
     # Range of Foxy has no field `variance`; the bag does not define it.
     whole = serialized(
         "sensor_msgs/msg/Range", header=header(START, "x"), radiation_type=0, field_of_view=1.0,
@@ -199,14 +199,14 @@ def test_files_that_are_not_bags_are_refused_with_the_reason(tmp_path, name, con
 
 
 @pytest.mark.parametrize("storage", ["mcap", "db3"])
-def test_an_empty_bag_is_refused_with_the_missing_topics(tmp_path, storage):
+def test_bag_without_topics_is_refused(tmp_path, storage):
     write = write_mcap if storage == "mcap" else write_sqlite
     path = write(tmp_path / f"bag.{storage}", [])
     with pytest.raises(BagError, match="no topics at all"):
         read_records(path)
 
 
-def test_a_topic_without_messages_is_refused_by_its_name(tmp_path):
+def test_topic_without_messages_is_refused_by_name(tmp_path):
     path = write_sqlite(tmp_path / "bag.db3", motion(n=20).messages())
     with sqlite3.connect(path) as database:
         database.execute("DELETE FROM messages WHERE topic_id = 2")
@@ -236,7 +236,7 @@ def test_types_defined_as_idl_are_understood(tmp_path):
     assert set(record.voltage) == {4.0}
 
 
-def test_a_wheel_that_never_spoke_does_not_hide_the_others(tmp_path):
+def test_wheels_are_read_when_another_has_no_messages(tmp_path):
     silent = motion(n=20, wheel="rear_left").messages()
     spoken = motion(n=20).messages()
     path = write_sqlite(tmp_path / "bag.db3", spoken + silent)

@@ -13,19 +13,19 @@ HOSTILE = load("hostile")
 
 @pytest.fixture(autouse=True)
 def _scaled(monkeypatch):
-    """Write a fifth of what repeats in each file, and lower the limits with it."""
+    """Reduce the repeated content of each file to a fifth, and lower the limits."""
     monkeypatch.setattr(HOSTILE, "SHARE", 0.2)
     monkeypatch.setattr(HOSTILE, "SECONDS", 15)
     monkeypatch.setattr(HOSTILE, "MEMORY", 500_000_000)
 
 
 @pytest.mark.parametrize("name", list(HOSTILE.CASES))
-def test_cost_is_bounded_by_the_size_of_a_file(name):
+def test_reading_cost_is_bounded_by_file_size(name):
     told, memory, wrong = HOSTILE.read(name)
     assert not wrong, (told, f"{memory / 1e6:.0f} MB")
 
 
-def test_a_workbook_that_takes_too_long_is_refused(tmp_path, monkeypatch):
+def test_workbook_exceeding_time_limit_is_refused(tmp_path, monkeypatch):
     monkeypatch.setattr(apart, "PATIENCE", 0.5)
     name, write, mapping = HOSTILE.CASES["xlsx: numbers"]
     write(tmp_path)

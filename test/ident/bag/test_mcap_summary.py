@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The summary at the end of an MCAP file, which says what the file holds and where."""
+"""The summary of an MCAP file: its schemas, channels, message counts and chunks."""
 
 import struct
 import subprocess
@@ -30,7 +30,7 @@ ZSTD = mcap.writer.CompressionType.ZSTD
     ],
     ids=str,
 )
-def test_summary_is_that_of_the_mcap_library(tmp_path, options):
+def test_summary_equals_that_of_mcap_library(tmp_path, options):
     messages = merged(motion(n=100), motion(n=70, wheel="rear_right", seed=2))
     path = write_mcap(tmp_path / "bag.mcap", messages, **options)
     with path.open("rb") as file:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Formats other than bags of ROS 2, from files written by other software."""
+"""Formats other than ROS 2 bags, from files written by other software."""
 
 import io
 import json
@@ -29,12 +29,14 @@ MAP = ["voltage=u velocity=y time=t"]
 
 
 def assert_motor(record: Any, n: int = N, speed: np.ndarray = SPEED) -> None:
-    """Assert that a record holds the signals: a command that holds from its instant on."""
+    """Assert that a record has the signals, with commands held from their stamps on."""
     assert len(record) == n
     np.testing.assert_allclose(record.time, TIME[:n], atol=1e-9)  # whole nanoseconds
     # Excel keeps 16 digits.
     np.testing.assert_allclose(record.voltage[1:], VOLTAGE[: n - 1], rtol=1e-15)
-    np.testing.assert_allclose(record.velocity, speed[:n], rtol=1e-15)  # one factor of a unit
+    np.testing.assert_allclose(
+        record.velocity, speed[:n], rtol=1e-15
+    )  # rounding of one unit factor
 
 
 def test_every_format_is_registered_once():
@@ -43,14 +45,14 @@ def test_every_format_is_registered_once():
 
 
 @pytest.mark.parametrize("compressed", [False, True])
-def test_vectors_of_a_matlab_file_are_columns(tmp_path, compressed):
+def test_matlab_vectors_are_read_as_columns(tmp_path, compressed):
     path = tmp_path / "log.mat"
     content = {"t": TIME, "u": VOLTAGE[:, None], "y": SPEED, "note": "a motor", "fs": 100.0}
     scipy.io.savemat(path, content, do_compression=compressed)
     assert_motor(read_records(path, MAP)["motor"])
 
 
-def test_fields_of_a_matlab_structure_and_columns_of_a_matrix_have_paths(tmp_path):
+def test_matlab_structure_fields_and_matrix_columns_are_addressed_by_path(tmp_path):
     path = tmp_path / "log.mat"
     log = {"time": TIME, "signals": {"values": np.stack([VOLTAGE, SPEED], axis=1)}}
     scipy.io.savemat(path, {"log": log}, do_compression=True)
@@ -58,7 +60,7 @@ def test_fields_of_a_matlab_structure_and_columns_of_a_matrix_have_paths(tmp_pat
     assert_motor(read_records(path, mapping)["motor"])
 
 
-def test_signals_of_a_simulink_scope_and_cells_have_their_places_as_paths(tmp_path):
+def test_simulink_scope_signals_and_cells_are_addressed_by_index(tmp_path):
     path = tmp_path / "log.mat"
     kinds = [("values", object), ("dimensions", object), ("label", object)]
     signals = np.array([(VOLTAGE, 1, "u"), (SPEED, 1, "w")], dtype=kinds)
@@ -88,7 +90,7 @@ def matlab_object(name: str, kind: str, order: str = "<") -> bytes:
 
 
 @pytest.mark.parametrize("compressed", [False, True])
-def test_objects_of_matlab_are_named_and_the_other_variables_read(tmp_path, compressed):
+def test_matlab_objects_are_reported_and_other_variables_read(tmp_path, compressed):
     path = tmp_path / "log.mat"
     scipy.io.savemat(path, {"t": TIME, "u": VOLTAGE, "y": SPEED}, do_compression=compressed)
     one, two = matlab_object("speedSeries", "timeseries"), matlab_object("out", "Simulink.Data")
@@ -107,7 +109,7 @@ def test_objects_of_matlab_are_named_and_the_other_variables_read(tmp_path, comp
         list_topics(path)
 
 
-def test_objects_of_version_7_3_are_named_and_the_other_variables_read(tmp_path):
+def test_matlab_7_3_objects_are_reported_and_other_variables_read(tmp_path):
     path = tmp_path / "log.mat"
     with h5py.File(path, "w", userblock_size=512) as file:
         for name, values in {"t": TIME, "u": VOLTAGE, "y": SPEED}.items():
@@ -123,7 +125,7 @@ def test_objects_of_version_7_3_are_named_and_the_other_variables_read(tmp_path)
     assert len(said) == 1 and "data (Simulink.SimulationData.Dataset)" in said[0]
 
 
-def test_a_matlab_file_of_version_4_has_signals_in_its_rows(tmp_path):
+def test_signals_in_rows_of_matlab_4_file_are_read(tmp_path):
     path = tmp_path / "log.mat"
     content = {"data": np.stack([TIME, VOLTAGE, SPEED]), "note": "QUARC", "fs": np.float32(100)}
     scipy.io.savemat(path, content, format="4")
@@ -135,7 +137,7 @@ def test_a_matlab_file_of_version_4_has_signals_in_its_rows(tmp_path):
         list_topics(path)
 
 
-def test_a_matlab_file_of_another_version_or_cut_off_is_one_line(tmp_path):
+def test_invalid_or_truncated_matlab_file_is_refused(tmp_path):
     hdf = tmp_path / "new.mat"
     hdf.write_bytes(b"MATLAB 7.3 MAT-file, Platform: GLNXA64".ljust(512) + b"\x89HDF\r\n\x1a\n")
     with pytest.raises(BagError, match=r"h5py|no readable MATLAB"):
@@ -151,7 +153,7 @@ ENTRIES = ("/drive/left volts", "NT:left/speed")
 
 
 def data_log(extra=b"", metadata="", speed=SPEED, names=ENTRIES):
-    """Return a data log by the published layout: records of few and of many bytes."""
+    """Return a data log of the published layout, with narrow and wide records."""
 
     def text(value: str) -> bytes:
         return struct.pack("<I", len(value)) + value.encode()
@@ -197,9 +199,7 @@ def test_entries_of_a_wpilib_data_log_are_signals_with_their_own_times(tmp_path)
         ('{"source":"NT"}', "", 1.0), ("[[[{", "", 1.0), ("RPM", "", np.pi / 30),
     ],
 )  # fmt: skip
-def test_the_unit_that_a_data_log_states_for_an_entry_is_its_unit(
-    tmp_path, metadata, radius, factor
-):
+def test_unit_in_wpilib_metadata_is_applied(tmp_path, metadata, radius, factor):
     """The classes SysIdRoutineLog of Java and of C++ write such metadata."""
     path = tmp_path / "robot.wpilog"
     names = ("voltage-left-drive", "velocity-left-drive")
@@ -209,7 +209,7 @@ def test_the_unit_that_a_data_log_states_for_an_entry_is_its_unit(
     np.testing.assert_allclose(record.velocity, SPEED, rtol=1e-12)
 
 
-def test_of_a_data_log_that_is_cut_off_the_rest_is_read(tmp_path):
+def test_truncated_wpilib_data_log_is_read_up_to_the_cut(tmp_path):
     path = tmp_path / "robot.wpilog"
     whole = data_log()
     path.write_bytes(whole[: len(whole) // 2])
@@ -223,8 +223,8 @@ def test_of_a_data_log_that_is_cut_off_the_rest_is_read(tmp_path):
 TESTS = ("slow-forward", "slow-backward", "fast-forward", "fast-backward")
 
 
-def sysid(path: Path, columns: list[np.ndarray], **keys: object) -> Path:
-    """Write rows as the documentation of SysId has them, a quarter of them in each test."""
+def write_sysid(path: Path, columns: list[np.ndarray], **keys: object) -> Path:
+    """Write a SysId file as documented, with a quarter of the rows in each test."""
     rows = np.array_split(np.stack(columns, axis=1), 4)
     tests = {test: some.tolist() for test, some in zip(TESTS, rows)}
     path.write_text(json.dumps({"sysid": True, "test": "Simple", **tests, **keys}))
@@ -232,7 +232,7 @@ def sysid(path: Path, columns: list[np.ndarray], **keys: object) -> Path:
 
 
 TURNS = np.cumsum(SPEED) * np.diff(TIME, prepend=0) / (2 * np.pi)  # of the output
-RATE = SPEED / (2 * np.pi)  # rotations a second
+RATE = SPEED / (2 * np.pi)  # rotations per second
 
 
 @pytest.mark.parametrize(
@@ -249,7 +249,7 @@ RATE = SPEED / (2 * np.pi)  # rotations a second
 def test_sysid_rotations_are_converted_to_radians(tmp_path, units, per_rotation, mapping):
     # docs/data-collection.md: "all positions and velocities should be in rotations"
     path = tmp_path / "sysid.json"
-    sysid(path, [TIME, VOLTAGE, TURNS, RATE], units=units, unitsPerRotation=per_rotation)
+    write_sysid(path, [TIME, VOLTAGE, TURNS, RATE], units=units, unitsPerRotation=per_rotation)
     record = read_records(path, mapping)["motor"]
     np.testing.assert_allclose(record.velocity, SPEED, rtol=1e-12)
     np.testing.assert_allclose(record.position, 2 * np.pi * TURNS, atol=1e-9)
@@ -258,33 +258,31 @@ def test_sysid_rotations_are_converted_to_radians(tmp_path, units, per_rotation,
 def test_each_test_of_sysid_is_a_segment(tmp_path):
     time = TIME + 10.0 * np.repeat(np.arange(4), N // 4)
     path = tmp_path / "sysid.json"
-    sysid(path, [time, VOLTAGE, TURNS, RATE], units="Rotations", unitsPerRotation=1.0)
+    write_sysid(path, [time, VOLTAGE, TURNS, RATE], units="Rotations", unitsPerRotation=1.0)
     assert read_records(path)["motor"].starts == tuple(range(0, N, N // 4))
 
 
 @pytest.mark.parametrize(("units", "wrong"), [("Rotations", 0.471), ("Radians", 1.0)])
-def test_units_per_rotation_that_contradict_the_unit_are_named_and_not_believed(
-    tmp_path, units, wrong
-):
+def test_units_per_rotation_contradicting_the_unit_are_reported_and_ignored(tmp_path, units, wrong):
     """wpilibsuite/sysid issue 319: 1 rotation = 0.471 rotations."""
     path = tmp_path / "sysid.json"
-    sysid(path, [TIME, VOLTAGE, TURNS, RATE], units=units, unitsPerRotation=wrong)
+    write_sysid(path, [TIME, VOLTAGE, TURNS, RATE], units=units, unitsPerRotation=wrong)
     record = read_records(path)["motor"]
     np.testing.assert_allclose(record.velocity, SPEED, rtol=1e-12)
     (finding,) = (f for f in record.findings if f.code == "units_per_rotation")
     assert finding.severity == "warning" and f"says {wrong:g}" in finding.message
 
 
-def drivetrain(path: Path) -> Path:
+def write_drivetrain(path: Path) -> Path:
     """Write a SysId file of a drivetrain whose wheels have a radius of 50 mm."""
     sides = [VOLTAGE, -VOLTAGE, TURNS, -TURNS, RATE, -RATE]
     columns = [TIME, *sides, np.zeros(N), np.zeros(N)]
     keys = {"test": "Drivetrain", "units": "Meters", "unitsPerRotation": 2 * np.pi * 0.05}
-    return sysid(path, columns, **keys)
+    return write_sysid(path, columns, **keys)
 
 
-def test_a_sysid_drivetrain_in_metres_needs_the_wheels_radius_only(tmp_path):
-    path = drivetrain(tmp_path / "sysid.json")
+def test_sysid_drivetrain_in_metres_requires_only_wheel_radius(tmp_path):
+    path = write_drivetrain(tmp_path / "sysid.json")
     with pytest.raises(BagError, match="give --map wheel_radius=METRES"):
         read_records(path)
     records = read_records(path, ["wheel_radius=0.05"])
@@ -297,7 +295,7 @@ def test_a_sysid_drivetrain_in_metres_needs_the_wheels_radius_only(tmp_path):
 
 
 def test_the_suggestion_for_a_drivetrain_in_metres_requests_the_radius(tmp_path):
-    path = drivetrain(tmp_path / "sysid.json")
+    path = write_drivetrain(tmp_path / "sysid.json")
     listing = list_topics(path)[0]
     assert "left.velocity=left_velocity:m/s" in listing.suggestion
     assert [text.partition("=")[0] for text in listing.asked] == ["wheel_radius"]
@@ -307,23 +305,25 @@ def test_the_suggestion_for_a_drivetrain_in_metres_requests_the_radius(tmp_path)
 
 
 @pytest.mark.parametrize("keys", [{}, {"units": "Radians"}])
-def test_rows_of_its_forerunner_have_six_columns(tmp_path, keys):
+def test_frc_characterization_rows_of_six_columns_are_read(tmp_path, keys):
     # frc-characterization, arm-characterization/data_analyzer.py of 2019: ``columns``
     path = tmp_path / "arm.json"
     battery, speed = np.full(N, 12.5), VOLTAGE / 12.5
-    sysid(path, [TIME, battery, speed, VOLTAGE, TURNS, SPEED], sysid=False, test="Arm", **keys)
+    write_sysid(
+        path, [TIME, battery, speed, VOLTAGE, TURNS, SPEED], sysid=False, test="Arm", **keys
+    )
     mapping = None if keys else ["voltage=voltage velocity=velocity time=time"]
     record = read_records(path, mapping)["motor"]
     np.testing.assert_allclose(record.velocity, SPEED)
     np.testing.assert_allclose(record.voltage[1:], VOLTAGE[:-1])
 
 
-def test_a_mechanism_of_its_forerunner_is_in_the_left_columns(tmp_path):
+def test_frc_characterization_mechanism_is_read_from_left_columns(tmp_path):
     # frc-characterization, Robot.java.mako since April 2020: ten columns in rotations
     path = tmp_path / "simple.json"
     zero = np.zeros(N)
     columns = [TIME, zero, zero, VOLTAGE, VOLTAGE, TURNS, TURNS, RATE, RATE, zero]
-    sysid(path, columns, sysid=False, test="Simple", units="Degrees", unitsPerRotation=360.0)
+    write_sysid(path, columns, sysid=False, test="Simple", units="Degrees", unitsPerRotation=360.0)
     records = read_records(path)
     assert list(records) == ["motor"]
     np.testing.assert_allclose(records["motor"].velocity, SPEED, rtol=1e-12)
@@ -353,7 +353,7 @@ def test_json_logs_of_any_shape_are_read(tmp_path, form):
     assert any(f.code == "damaged_recording" for f in record.findings) is (form == "lines")
 
 
-def test_messages_of_several_kinds_in_one_jsonl_are_told_apart(tmp_path):
+def test_jsonl_of_interleaved_message_kinds_is_read(tmp_path):
     path = tmp_path / "log.jsonl"
     lines = []
     for t, u, y in zip(TIME.tolist(), VOLTAGE.tolist(), SPEED.tolist()):
@@ -377,7 +377,7 @@ def test_a_workbook_is_read_with_names_and_units(tmp_path):
     assert_motor(read_records(tmp_path / "log.xlsx", MAP)["motor"])
 
 
-def test_of_a_workbook_the_longest_sheet_is_read(tmp_path):
+def test_longest_sheet_of_workbook_is_read(tmp_path):
     book = openpyxl.Workbook()
     for row in (["sensor", "Hz", "ms"], ["gyro", 8000, 0.125], ["compass", 200, 5]):
         book.active.append(row)
@@ -388,8 +388,8 @@ def test_of_a_workbook_the_longest_sheet_is_read(tmp_path):
     assert_motor(read_records(tmp_path / "log.xlsx", MAP)["motor"])
 
 
-def ros1_bag(path: Path, compression: Any = None) -> Path:
-    """Write a bag of ROS 1 by rosbags."""
+def write_ros1_bag(path: Path, compression: Any = None) -> Path:
+    """Write a ROS 1 bag with rosbags."""
     store = get_typestore(Stores.ROS1_NOETIC)
     number, joints = "std_msgs/msg/Float64", "sensor_msgs/msg/JointState"
     header, stamp = store.types["std_msgs/msg/Header"], store.types["builtin_interfaces/msg/Time"]
@@ -419,13 +419,13 @@ ROS1 = ["voltage=/pwm.data velocity=/joint_states.velocity[right] clock=log"]
 
 
 @pytest.mark.parametrize("compression", [None, "BZ2", "LZ4"])
-def test_a_bag_of_ros_1_is_read_as_it_is(tmp_path, compression):
+def test_ros1_bag_is_read_without_conversion(tmp_path, compression):
     kind = None if compression is None else Writer.CompressionFormat[compression]
-    assert_motor(read_records(ros1_bag(tmp_path / "old.bag", kind), ROS1)["motor"])
+    assert_motor(read_records(write_ros1_bag(tmp_path / "old.bag", kind), ROS1)["motor"])
 
 
-def test_of_a_bag_of_ros_1_that_is_cut_off_the_rest_is_read(tmp_path):
-    path = ros1_bag(tmp_path / "old.bag")
+def test_truncated_ros1_bag_is_read_up_to_the_cut(tmp_path):
+    path = write_ros1_bag(tmp_path / "old.bag")
     whole = path.read_bytes()
     path.write_bytes(whole[: len(whole) * 2 // 5])
     record = read_records(path, ROS1)["motor"]
@@ -434,7 +434,7 @@ def test_of_a_bag_of_ros_1_that_is_cut_off_the_rest_is_read(tmp_path):
     assert any(f.code == "damaged_recording" for f in record.findings)
 
 
-def test_a_workbook_is_read_as_excel_shows_it(tmp_path):
+def test_number_formats_of_workbook_are_applied(tmp_path):
     # ECMA-376, 18.8.30: a percentage shows a hundred times the stored value; times are
     # parts of a day
     book = openpyxl.Workbook()

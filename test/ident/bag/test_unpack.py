@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Decompression of all kinds, with several frames or cut off, and its limit."""
+"""Decompression of all kinds, of several or truncated frames, and its limit."""
 
 import bz2
 import math
@@ -49,15 +49,15 @@ def test_all_frames_of_a_block_are_unpacked_and_counted(kind, budget):
 
 
 @pytest.mark.parametrize("kind", PACK)
-def test_frames_come_out_whole_whatever_the_blocks_they_are_read_in(kind):
+def test_decompression_does_not_depend_on_block_size(kind):
     packed = b"".join(PACK[kind](part) for part in PARTS)
     for length in (1, 7, 1023, 1024, 1025, 1 << 16):
         if length == 1 and kind == "bz2":
-            continue  # slow and no other way
+            continue  # slow, and the same code path
         blocks = [packed[k : k + length] for k in range(0, len(packed), length)]
         assert b"".join(decompress_stream(blocks, kind)) == PLAIN
     biggest = max(len(piece) for piece in decompress_stream([packed], kind))
-    # 1024 bytes of zstd expand to at most 256 blocks of 128 KiB; the others come by the MiB.
+    # 1024 bytes of zstd expand to at most 256 blocks of 128 KiB; the others yield 1 MiB at most.
     assert biggest <= (256 << 17 if kind == "zstd" else 1 << 20)
     with pytest.raises(EOFError):
         list(decompress_stream([], kind))
@@ -66,7 +66,7 @@ def test_frames_come_out_whole_whatever_the_blocks_they_are_read_in(kind):
 
 
 @pytest.mark.parametrize("kind", PACK)
-def test_the_part_of_a_block_before_its_cut_is_kept(kind, budget):
+def test_truncated_block_is_decompressed_up_to_the_cut(kind, budget):
     packed = PACK[kind](PARTS[0]) + PACK[kind](PARTS[1])[:-300]
     kept = decompress(packed, kind, budget)
     assert PLAIN.startswith(kept) and len(kept) >= len(PARTS[0])
@@ -77,7 +77,7 @@ def test_the_part_of_a_block_before_its_cut_is_kept(kind, budget):
     assert decompress(b"no frame at all", kind, budget) == b""
 
 
-def test_an_unknown_compression_is_named(budget):
+def test_unknown_compression_is_refused_by_name(budget):
     with pytest.raises(BagError, match="'snappy' is not supported; use zstd, lz4 or bz2"):
         decompress(b"", "snappy", budget)
 
@@ -86,7 +86,7 @@ def test_an_unknown_compression_is_named(budget):
     ("given", "limit"),
     [("", 256e6), ("1000", 1000), ("2k", 2048), ("3M", 3 * 2**20), (" 1.5G ", 1.5 * 2**30)],
 )
-def test_the_limit_follows_from_the_size_or_from_the_user(given, limit, monkeypatch):
+def test_decompression_limit_is_set_by_file_size_or_user(given, limit, monkeypatch):
     monkeypatch.setenv("SMP_BAG_UNPACKED", given)
     budget = Budget("a.mcap", 100_000)
     assert budget.limit == budget.left == limit
@@ -98,7 +98,7 @@ def test_the_limit_follows_from_the_size_or_from_the_user(given, limit, monkeypa
             Budget("a.mcap", 1)
 
 
-def test_the_limit_itself_may_be_taken_and_not_a_byte_more(monkeypatch):
+def test_decompression_limit_is_exact_to_the_byte(monkeypatch):
     monkeypatch.setenv("SMP_BAG_UNPACKED", "3000000")
     budget = Budget("a.mcap", 1)
     budget.take(2_999_999)
@@ -128,7 +128,7 @@ def test_a_file_is_unpacked_and_damage_is_reported(kind, budget, tmp_path):
         unpack_file(tmp_path / "none", plain, kind, budget)
 
 
-def test_messages_that_were_packed_one_by_one_are_unpacked_and_the_lost_counted(budget):
+def test_individually_compressed_messages_are_decompressed_and_losses_counted(budget):
     channel = Channel(1, "/a", "std_msgs/msg/String")
     blobs = [b"", b"abc", b"plain and long", zstd.compress(b"one" * 50),
              lz4.frame.compress(b"two" * 50), zstd.compress(b"three" * 50)[:9],

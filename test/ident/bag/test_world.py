@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Tables in the forms of many loggers, each with the same 300 samples."""
+"""Tables in the formats of common loggers, each with the same 300 samples."""
 
 from collections.abc import Callable
 
@@ -27,17 +27,17 @@ def text(lines: list[str], head: str = "t,u,y") -> str:
     return "\n".join([head, *lines] if head else lines)
 
 
-def with_lines(lines: list[str], *strange: str) -> list[str]:
+def insert_lines(lines: list[str], *strange: str) -> list[str]:
     return [*lines[:100], *strange, *lines[100:]]
 
 
 TABLES: dict[str, tuple[str, str, str]] = {
     # text, mapping, the finding's code
-    "no names": (text(rows(), ""), "voltage=c2 velocity=c3 time=c1", "no_column_names"),
-    "a row of units": (text(rows(time=lambda k: str(10 * k)), "t,u,y\n[ms],[V],[rad/s]"), MAP, ""),
+    "no column names": (text(rows(), ""), "voltage=c2 velocity=c3 time=c1", "no_column_names"),
+    "row of units": (text(rows(time=lambda k: str(10 * k)), "t,u,y\n[ms],[V],[rad/s]"), MAP, ""),
     "ISO times": (text(rows(time=lambda k: ISO[k] + "Z")), MAP, ""),
-    "dates and blanks": (text(rows(time=lambda k: ISO[k].replace("T", " "))), MAP, ""),
-    "another zone": (text(rows(time=lambda k: ISO[k] + "+02:00")), MAP, ""),
+    "dates with a space": (text(rows(time=lambda k: ISO[k].replace("T", " "))), MAP, ""),
+    "time zone offset": (text(rows(time=lambda k: ISO[k] + "+02:00")), MAP, ""),
     "time of day": (text(rows(time=lambda k: ISO[k][11:])), MAP, ""),
     "nanoseconds since 1970": (
         text(rows(time=lambda k: str(1_780_000_000_000_000_000 + 10_000_000 * k))),
@@ -49,22 +49,22 @@ TABLES: dict[str, tuple[str, str, str]] = {
         MAP,
         "time_unit",
     ),
-    "a time that begins anywhere": (text(rows(time=lambda k: f"{7060 + T[k]:.2f}")), MAP, ""),
+    "time not starting at zero": (text(rows(time=lambda k: f"{7060 + T[k]:.2f}")), MAP, ""),
     "stray lines": (
-        text(with_lines(rows(), "t,u,y", "# restarted", "Brown-out!")),
+        text(insert_lines(rows(), "t,u,y", "# restarted", "Brown-out!")),
         MAP,
         "stray_rows",
     ),
-    "a preamble": (text(rows(), "Scope 4000\nDate;Monday\n\nt,u,y"), MAP, ""),
-    "a separator too many": (text([line + "," for line in rows()], "t,u,y,"), MAP, ""),
-    "a column of words": (text([line + ",run" for line in rows()], "t,u,y,state"), MAP, ""),
-    "names of another language": (text(rows(), "时间,Spannung,vitesse mesurée"),
-                                  "voltage=Spannung velocity=vitesse mesurée time=时间", ""),
+    "preamble": (text(rows(), "Scope 4000\nDate;Monday\n\nt,u,y"), MAP, ""),
+    "trailing separator": (text([line + "," for line in rows()], "t,u,y,"), MAP, ""),
+    "text column": (text([line + ",run" for line in rows()], "t,u,y,state"), MAP, ""),
+    "names in other languages": (text(rows(), "时间,Spannung,vitesse mesurée"),
+                                 "voltage=Spannung velocity=vitesse mesurée time=时间", ""),
 }  # fmt: skip
 
 
 @pytest.mark.parametrize("name", list(TABLES))
-def test_a_table_of_the_world_is_read(tmp_path, name):
+def test_tables_of_common_loggers_are_read(tmp_path, name):
     content, mapping, code = TABLES[name]
     (tmp_path / "log.csv").write_text(content)
     record = read_records(tmp_path / "log.csv", [mapping])["motor"]
@@ -77,7 +77,7 @@ def test_a_table_of_the_world_is_read(tmp_path, name):
     )
 
 
-def test_set_and_state_in_two_files_are_one_recording_on_their_clocks(tmp_path):
+def test_command_and_state_files_are_merged_by_time(tmp_path):
     (tmp_path / "set.csv").write_text(
         text([f"{t:.3f},{u!r}" for t, u in zip(T, U.tolist())], "t,u")
     )
@@ -87,18 +87,18 @@ def test_set_and_state_in_two_files_are_one_recording_on_their_clocks(tmp_path):
     record = read_records(tmp_path, ["voltage=/set.u velocity=/state.w time=t"])["motor"]
     assert record.source == "set+state"
     np.testing.assert_array_equal(record.velocity, Y)
-    # 6 ms of an interval of 10 ms the voltage was the last one's, 4 ms the next one's.
+    # In each 10 ms interval the previous voltage holds for 6 ms, the next one for 4 ms.
     np.testing.assert_allclose(record.voltage[1:], 0.6 * U[:-1] + 0.4 * U[1:], rtol=1e-6)
 
 
-def test_a_file_with_more_words_than_rows_is_refused_by_its_line(tmp_path):
+def test_table_with_too_many_text_lines_is_refused_by_line(tmp_path):
     lines = [line if k % 10 else "Brown-out!" for k, line in enumerate(rows())]
     (tmp_path / "log.csv").write_text(text(lines))
     with pytest.raises(BagError, match="line 12, column 't': 'Brown-out!' is not a number"):
         read_records(tmp_path / "log.csv", [MAP])
 
 
-def test_a_record_whose_first_row_is_the_step_keeps_it(tmp_path):
+def test_step_at_first_row_is_kept(tmp_path):
     lines = [f"{t:.2f},6,{60 * (1 - np.exp(-t / 0.1)):.6f}" for t in T]
     (tmp_path / "log.csv").write_text(text(lines))
     record = read_records(tmp_path / "log.csv", [MAP])["motor"]

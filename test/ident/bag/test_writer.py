@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The bag writer: what ros2 bag and rosbags expect, at every moment."""
+"""Bags of the writer are valid for ros2 bag and rosbags at any time."""
 
 import threading
 import tracemalloc
@@ -22,7 +22,7 @@ def float_bytes(value: float) -> bytes:
     return data
 
 
-def test_metadata_are_those_of_version_nine(tmp_path):
+def test_metadata_have_format_version_nine(tmp_path):
     with BagWriter(tmp_path / "bag") as bag:
         bag.add_topic("/b", FLOAT, [{"reliability": "best_effort", "depth": 7}])
         bag.write("/a", FLOAT, float_bytes(1.0), 1_000)
@@ -49,7 +49,7 @@ def test_metadata_are_those_of_version_nine(tmp_path):
     assert topics["/a"]["topic_metadata"]["type_description_hash"] == expected
 
 
-def test_the_file_is_indexed_and_checked_by_the_mcap_library(tmp_path):
+def test_index_and_checksums_are_accepted_by_mcap_library(tmp_path):
     with BagWriter(tmp_path / "bag") as bag:
         for k in range(100):
             bag.write("/a", FLOAT, float_bytes(k), 1_000 + k)
@@ -67,7 +67,7 @@ def test_the_file_is_indexed_and_checked_by_the_mcap_library(tmp_path):
     assert b"float64 data" in schema.data
 
 
-def test_every_flush_leaves_a_whole_bag(tmp_path):
+def test_bag_is_complete_after_every_flush(tmp_path):
     bag = BagWriter(tmp_path / "bag")
     for k in range(30):
         bag.write(f"/t{k % 3}", FLOAT, float_bytes(k), 1_000 + k)
@@ -92,7 +92,7 @@ def test_a_bag_is_never_overwritten(tmp_path):
         BagWriter(tmp_path / "file" / "bag")
 
 
-def test_a_bag_without_messages_is_whole(tmp_path):
+def test_bag_without_messages_is_readable(tmp_path):
     with BagWriter(tmp_path / "bag") as bag:
         bag.add_topic("/a", FLOAT)
     with AnyReader([tmp_path / "bag"]) as reader:
@@ -101,7 +101,7 @@ def test_a_bag_without_messages_is_whole(tmp_path):
     assert list(Replay(tmp_path / "bag").messages()) == []
 
 
-def test_an_unknown_type_is_kept_without_its_definition(tmp_path):
+def test_messages_of_unknown_type_are_written_without_definition(tmp_path):
     with BagWriter(tmp_path / "bag") as bag:
         assert not bag.add_topic("/odd", "strange_msgs/msg/Thing")
         assert bag.add_topic("/a", FLOAT)
@@ -109,7 +109,7 @@ def test_an_unknown_type_is_kept_without_its_definition(tmp_path):
     assert [data for _, _, data in Replay(tmp_path / "bag").messages()] == [b"12345678"]
 
 
-def test_many_threads_may_write(tmp_path):
+def test_concurrent_writes_lose_no_message(tmp_path):
     data = float_bytes(1.0)
     with BagWriter(tmp_path / "bag", flush_period=0.001) as bag:
 
@@ -127,7 +127,7 @@ def test_many_threads_may_write(tmp_path):
         assert sum(1 for _ in reader.messages()) == 2000
 
 
-def test_replay_gives_messages_in_order_over_chunks_and_files(tmp_path):
+def test_replay_orders_messages_within_and_across_chunks(tmp_path):
     with BagWriter(tmp_path / "bag") as bag:
         for k in range(200):
             # Within a chunk of ten, and from chunk to chunk, stamps come a little out of order.
@@ -158,7 +158,7 @@ def test_recorded_qos_of_every_version_is_understood(qos, expected):
 
 
 @pytest.mark.parametrize("storage", ["mcap", "db3"])
-def test_unmapped_topics_take_no_memory(tmp_path, storage):
+def test_unmapped_topics_are_not_loaded_into_memory(tmp_path, storage):
     truth = motion(n=500)
     image = bytes(200_000)
     images = [
@@ -176,5 +176,5 @@ def test_unmapped_topics_take_no_memory(tmp_path, storage):
     _, peak = tracemalloc.get_traced_memory()
     tracemalloc.stop()
     assert_read(record, truth)
-    # A few chunks of a megabyte at a time, of twenty.
+    # A few chunks of 1 MB at a time, of twenty.
     assert peak < 6_000_000
