@@ -31,7 +31,7 @@ def arrivals(kind: str, n: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
 
 @pytest.mark.parametrize("kind", ["exponential", "bursts", "coarse"])
 @pytest.mark.parametrize("seed", [1, 2, 3])
-def test_the_lower_envelope_of_the_arrivals_is_the_beat(kind, seed):
+def test_sampling_times_are_recovered_from_lower_envelope_of_arrivals(kind, seed):
     late, true = arrivals(kind, 4000, seed)
     beat = find_beat(late)
     wrong = beat.time - true
@@ -40,7 +40,7 @@ def test_the_lower_envelope_of_the_arrivals_is_the_beat(kind, seed):
     assert beat.period == pytest.approx(1.0003 * T, rel=1e-4)
 
 
-def test_few_lost_samples_leave_the_beat_where_it_is():
+def test_sampling_times_are_recovered_when_few_samples_are_lost():
     rng = np.random.default_rng(4)
     true = T * np.arange(4000)
     late = np.maximum.accumulate(true + rng.exponential(0.3 * T, true.size))
@@ -51,18 +51,18 @@ def test_few_lost_samples_leave_the_beat_where_it_is():
     assert np.std(beat.time - true[kept]) < np.std(late[kept] - true[kept])
 
 
-def test_intervals_that_are_random_by_themselves_have_no_beat():
+def test_random_sampling_intervals_have_no_period():
     rng = np.random.default_rng(5)
     time = np.cumsum(rng.uniform(0.3 * T, 1.7 * T, 4000)).astype(np.int64)
     assert find_beat(time) is None
 
 
-def test_a_regular_time_is_left_as_it_is():
+def test_regular_times_are_not_corrected():
     assert find_beat(arrivals("none", 1000, 1)[0]) is None
 
 
 @pytest.mark.parametrize("kind", ["exponential", "coarse"])
-def test_a_log_of_arrival_times_is_read_on_the_beat(tmp_path, kind):
+def test_log_of_arrival_times_is_moved_to_sampling_times(tmp_path, kind):
     late, true = arrivals(kind, 2000, 6)
     motion = np.sin(2 * np.pi * true * 1e-9)  # 1 Hz, smooth on its true instants
     rows = [f"{t * 1e-9:.6f},{k % 7},{y:.9f}" for k, (t, y) in enumerate(zip(late, motion))]
@@ -73,17 +73,17 @@ def test_a_log_of_arrival_times_is_read_on_the_beat(tmp_path, kind):
     assert np.ptp(record.time - true * 1e-9) < 0.05e-9 * T
 
 
-def test_honest_stamps_with_jitter_are_kept(tmp_path):
+def test_jittered_stamps_consistent_with_motion_are_kept(tmp_path):
     rng = np.random.default_rng(7)
     time = T * np.arange(2000) + rng.uniform(0, 0.8 * T, 2000)
-    motion = np.sin(2 * np.pi * time * 1e-9)  # measured when the stamp says so
+    motion = np.sin(2 * np.pi * time * 1e-9)  # sampled at the time of the stamp
     rows = [f"{t * 1e-9:.9f},{k % 7},{y:.9f}" for k, (t, y) in enumerate(zip(time, motion))]
     (tmp_path / "log.csv").write_text("t,u,y\n" + "\n".join(rows))
     record = read_records(tmp_path / "log.csv", ["voltage=u velocity=y time=t"])["motor"]
     assert "arrival_beat" not in [finding.code for finding in record.findings]
 
 
-def _late_motor(kind: str, seed: int) -> tuple[Record, float]:
+def _record_with_late_stamps(kind: str, seed: int) -> tuple[Record, float]:
     """Return a chirp's record with arrival stamps, and the motor's L/R [s]."""
     rng = np.random.default_rng(seed)
     r, l, k, j, b, tc = 0.84, 1.75e-3, 0.0508, 8e-4, 2.06e-4, 0.02
@@ -101,8 +101,8 @@ def _late_motor(kind: str, seed: int) -> tuple[Record, float]:
 
 
 @pytest.mark.parametrize("kind", ["exponential", "bursts"])
-def test_a_record_with_arrival_stamps_is_estimated_on_the_beat(kind):
-    record, electric = _late_motor(kind, 8)
+def test_inductance_is_estimated_from_record_with_arrival_stamps(kind):
+    record, electric = _record_with_late_stamps(kind, 8)
     found = estimate(record)
     assert "arrival_beat" in [finding.code for finding in found.findings]
     assert not found.unreliable
@@ -111,7 +111,7 @@ def test_a_record_with_arrival_stamps_is_estimated_on_the_beat(kind):
     assert ratio == pytest.approx(electric, rel=0.1)
 
 
-def test_a_record_with_stamps_of_its_own_keeps_them():
+def test_record_with_irregular_sampling_stamps_is_unchanged():
     rng = np.random.default_rng(9)
     time = np.sort(1e-2 * np.arange(2000) + rng.uniform(0, 0.8e-2, 2000))
     record = Record("m", time, np.sin(time), velocity=np.sin(2 * np.pi * time))
@@ -119,11 +119,11 @@ def test_a_record_with_stamps_of_its_own_keeps_them():
 
 
 @pytest.mark.parametrize("rounding", [np.floor, np.rint])
-def test_a_regular_time_that_was_only_rounded_is_put_back_whatever_the_motion_shows(rounding):
+def test_rounding_of_regular_times_is_undone_when_motion_is_noisy(rounding):
     rng = np.random.default_rng(12)
-    period, multiple = 2.3e-3, 1e-3  # a loop by a clock of milliseconds
+    period, multiple = 2.3e-3, 1e-3  # a loop stamped by a clock with a resolution of 1 ms
     at = period * np.arange(3000)
-    speed = np.sin(3 * at) + rng.standard_normal(at.size)  # noise hides where samples lie
+    speed = np.sin(3 * at) + rng.standard_normal(at.size)  # noise hides the sampling times
     sampled_late = at + rng.uniform(0, 1.2e-3, at.size)
 
     def stamped(time: np.ndarray) -> Record:
@@ -135,8 +135,8 @@ def test_a_regular_time_that_was_only_rounded_is_put_back_whatever_the_motion_sh
     assert move_to_beat(late) is late
 
 
-def _stalled(seed: int, sampled_late: bool) -> Record:
-    """Return a record of a machine with pauses, in its stamps or in its samples."""
+def _record_with_stalls(seed: int, sampled_late: bool) -> Record:
+    """Return a record with stalls that delay its stamps alone or its samples as well."""
     rng = np.random.default_rng(seed)
     beat = 5e-3 * np.arange(1600)
     stamp = beat + 1e-4 * rng.random(beat.size)
@@ -149,13 +149,13 @@ def _stalled(seed: int, sampled_late: bool) -> Record:
 
 
 @pytest.mark.parametrize("seed", range(8))
-def test_samples_that_a_stall_made_late_keep_their_stamps_and_late_stamps_do_not(seed):
-    honest, arrived = _stalled(seed, True), _stalled(seed, False)
+def test_stalled_samples_keep_their_stamps_and_delayed_stamps_are_corrected(seed):
+    honest, arrived = _record_with_stalls(seed, True), _record_with_stalls(seed, False)
     assert move_to_beat(honest) is honest
     assert "arrival_beat" in [finding.code for finding in move_to_beat(arrived).findings]
 
 
-def test_how_sure_the_beat_is_of_its_period_is_how_it_scatters():
+def test_standard_error_of_period_matches_scatter_of_estimates():
     found = []
     for seed in range(40):
         rng = np.random.default_rng(seed)
@@ -163,12 +163,12 @@ def test_how_sure_the_beat_is_of_its_period_is_how_it_scatters():
         beat = find_beat(np.rint(late).astype(np.int64))
         found.append((beat.period, beat.deviation))
     periods, deviations = np.array(found).T
-    # A jackknife of eight parts of an edge of a hull errs to the safe side, by 2.2 here.
+    # A jackknife of eight parts of a hull's edge is conservative, by a factor of 2.2 here.
     assert 0.5 < np.sqrt(np.mean(deviations**2)) / np.std(periods - T) < 3.0
 
 
 @pytest.mark.parametrize("held", [1, 40])
-def test_a_held_command_that_comes_in_bunches_is_put_back_on_its_beat(tmp_path, held):
+def test_bunched_commands_are_moved_to_their_sampling_times(tmp_path, held):
     n = 900
     volts = np.repeat(np.random.default_rng(2).uniform(-6, 6, n // held + 1), held)[:n]
     at = START + 30_000_000 * (np.arange(n) // 3 + 1)

@@ -29,9 +29,9 @@ def codes(record) -> list[str]:
     return [finding.code for finding in record.findings]
 
 
-def test_values_that_jump_impossibly_are_left_out(tmp_path):
+def test_velocity_outliers_are_removed(tmp_path):
     speed = SPEED.copy()
-    speed[100], speed[200] = 1e200, speed[200] + 500  # spoilt exponent, spoilt mantissa
+    speed[100], speed[200] = 1e200, speed[200] + 500  # corrupted exponent, corrupted mantissa
     path = write(tmp_path / "log.csv", t=T, u=U, y=speed)
     record = read_records(path, ["voltage=u velocity=y time=t"])["motor"]
     assert np.flatnonzero(np.isnan(record.velocity)).tolist() == [100, 200]
@@ -39,7 +39,7 @@ def test_values_that_jump_impossibly_are_left_out(tmp_path):
 
 
 @pytest.mark.parametrize("shape", ["pulses", "steps", "quantised", "rest"])
-def test_no_sample_of_a_real_motion_is_left_out(tmp_path, shape):
+def test_valid_motion_loses_no_sample_as_outlier(tmp_path, shape):
     voltage, speed = U.copy(), SPEED.copy()
     if shape == "pulses":
         voltage = np.where(np.arange(N) % 50 == 0, 12.0, 0.0)
@@ -64,7 +64,7 @@ def read_count(path: Path, count: np.ndarray, bits: int = 0) -> Record:
 
 
 @pytest.mark.parametrize("spoilt", [-(1 << 62), 3 << 40, 3 << 20])
-def test_a_count_that_jumps_impossibly_is_left_out_with_its_sample(tmp_path, spoilt):
+def test_sample_with_count_outlier_is_removed(tmp_path, spoilt):
     count = COUNT.copy()
     count[150] += spoilt
     record = read_count(tmp_path / "log.csv", count)
@@ -72,9 +72,9 @@ def test_a_count_that_jumps_impossibly_is_left_out_with_its_sample(tmp_path, spo
     np.testing.assert_array_equal(record.count, np.delete(COUNT, 150))
 
 
-def test_a_counter_that_turns_to_and_fro_where_it_wraps_loses_no_sample(tmp_path):
+def test_counter_oscillating_across_its_wrap_loses_no_sample(tmp_path):
     to_and_fro = np.rint(30 * np.sin(0.4 * np.arange(N))).astype(np.int64)
-    to_and_fro[: N // 2] = 1000  # most of its steps are zero
+    to_and_fro[: N // 2] = 1000  # most steps are zero
     record = read_count(tmp_path / "log.csv", to_and_fro % (1 << 16), 16)
     assert "impossible_jump" not in codes(record)
     assert record.count is not None and record.count.size == N
@@ -82,17 +82,17 @@ def test_a_counter_that_turns_to_and_fro_where_it_wraps_loses_no_sample(tmp_path
 
 
 @pytest.mark.parametrize("every", [2, 3])
-def test_a_count_of_two_publishers_is_named(tmp_path, every):
+def test_count_alternating_between_two_publishers_is_refused(tmp_path, every):
     count = COUNT.copy()
-    count[::every] = 70_000  # a forgotten node whose motor stands
+    count[::every] = 70_000  # a forgotten node whose motor is at rest
     with pytest.raises(BagError, match=r"alternates between two counters.*two nodes published it"):
         read_count(tmp_path / "log.csv", count)
-    count[::every] = COUNT[::every] + 900  # closer than a wheel turns in a sample
+    count[::every] = COUNT[::every] + 900  # within the motion of one sample
     read_count(tmp_path / "log.csv", count)
 
 
 @pytest.mark.parametrize("kind", ["armature", "offset", "without sign", "supply"])
-def test_a_current_without_sign_is_left_out_and_the_speed_kept(tmp_path, kind):
+def test_unsigned_current_is_dropped_and_velocity_kept(tmp_path, kind):
     speed = SPEED
     armature = (U - 0.045 * speed) / 2 + 0.05 * np.sign(speed) + RNG.normal(0, 0.01, N)
     current = {
@@ -110,7 +110,7 @@ def test_a_current_without_sign_is_left_out_and_the_speed_kept(tmp_path, kind):
 
 
 @pytest.mark.parametrize("levels", [(0, 1), (-1, 1)])
-def test_the_sign_comes_from_a_direction_column(tmp_path, levels):
+def test_voltage_sign_is_taken_from_direction_column(tmp_path, levels):
     direction = np.where(U > 0, levels[1], levels[0])
     path = write(tmp_path / "log.csv", t=T, pwm=np.abs(U) / 12 * 255, dir=direction, y=SPEED)
     mapping = "voltage=pwm:pwm direction=dir velocity=y time=t supply_voltage=12"
@@ -121,7 +121,7 @@ def test_the_sign_comes_from_a_direction_column(tmp_path, levels):
 
 
 @pytest.mark.parametrize("codes_of", [("F", "R"), ("fwd", "rev"), ("forwards", "backwards")])
-def test_a_direction_may_be_written_in_words(tmp_path, codes_of):
+def test_direction_is_read_from_words(tmp_path, codes_of):
     ways = [codes_of[0] if u > 0 else codes_of[1] for u in U]
     rows = [f"{t},{abs(u)},{way},{y}" for t, u, way, y in zip(T, U, ways, SPEED)]
     (tmp_path / "log.csv").write_text("\n".join(["t,u,dir,y", *rows]))
@@ -130,7 +130,7 @@ def test_a_direction_may_be_written_in_words(tmp_path, codes_of):
 
 
 @pytest.mark.parametrize("still", [0, 1])  # a third code for standstill
-def test_codes_of_a_direction_that_are_no_signs_are_questioned(tmp_path, still):
+def test_ambiguous_direction_codes_are_refused(tmp_path, still):
     volts = U * (np.arange(N) % 40 >= 20 * still)
     direction = np.select([volts > 0, volts < 0], [1, 2], 0)
     path = write(tmp_path / "log.csv", t=T, u=np.abs(volts), dir=direction, y=SPEED)
@@ -141,7 +141,7 @@ def test_codes_of_a_direction_that_are_no_signs_are_questioned(tmp_path, still):
     np.testing.assert_allclose(record.voltage[1:], volts[:-1], rtol=1e-12)
 
 
-def test_a_speed_of_the_rim_needs_the_wheels_radius(tmp_path):
+def test_rim_speed_requires_wheel_radius(tmp_path):
     path = write(tmp_path / "log.csv", t=T, u=U, y=0.03 * SPEED)
     record = read_records(path, ["voltage=u velocity=y:m/s time=t wheel_radius=0.03"])["motor"]
     np.testing.assert_allclose(record.velocity, SPEED, atol=1e-12)
@@ -149,24 +149,24 @@ def test_a_speed_of_the_rim_needs_the_wheels_radius(tmp_path):
         read_records(path, ["voltage=u velocity=y:m/s time=t"])
 
 
-def test_a_driver_puts_out_no_more_than_its_supply(tmp_path):
+def test_pwm_beyond_full_scale_is_clipped_to_supply_voltage(tmp_path):
     rng = np.random.default_rng(5)
     pwm = rng.integers(-255, 256, 400)
-    pwm[100:110] = 1000  # a controller's output before it is clipped, or a code
+    pwm[100:110] = 1000  # an unclipped controller output, or an error code
     rows = [f"{0.01 * k},{u},{0.1 * k}" for k, u in enumerate(pwm)]
     path = tmp_path / "log.csv"
     path.write_text("\n".join(["t,pwm,w", *rows]))
     mapping = "time=t voltage=pwm:pwm velocity=w pwm_full_scale=255 supply_voltage=12 held=after"
     record = read_records(path, [mapping])["motor"]
-    # A value held from its row on is the mean of the interval that ends one row later.
+    # A value held from its row on is the mean of the interval to the next row.
     np.testing.assert_allclose(record.voltage[1:], np.clip(pwm / 255 * 12, -12, 12)[:-1])
     (found,) = (f for f in record.findings if f.code == "beyond_full_scale")
     assert found.evidence["samples"] == 10
     assert "392 %" in found.message
 
 
-def signed(folder: Path, direction: str) -> Path:
-    """Write a signed command and a column of its direction."""
+def write_signed_command(folder: Path, direction: str) -> Path:
+    """Write a signed command and a direction column."""
     rng = np.random.default_rng(4)
     pwm = np.repeat(rng.choice([-80, -40, 0, 40, 80], 30), 20)
     words = {1: "FWD", 0: "FWD", -1: "REV"}
@@ -177,8 +177,8 @@ def signed(folder: Path, direction: str) -> Path:
 
 
 @pytest.mark.parametrize("direction", ["own", "one"])
-def test_a_command_that_has_a_sign_needs_no_direction(tmp_path, direction):
-    path = signed(tmp_path, direction)
+def test_direction_column_is_ignored_for_signed_command(tmp_path, direction):
+    path = write_signed_command(tmp_path, direction)
     mapping = ["voltage=pwm:% supply_voltage=12 velocity=w time=t"]
     plain = read_records(path, mapping)["motor"]
     record = read_records(path, [*mapping, "direction=way"])["motor"]
@@ -197,7 +197,7 @@ def test_a_command_that_has_a_sign_needs_no_direction(tmp_path, direction):
         ("/motor/pwm_cmd.data", None),
     ],
 )
-def test_a_speed_command_mapped_as_a_voltage_is_told(tmp_path, field, severity):
+def test_speed_command_mapped_as_voltage_is_reported(tmp_path, field, severity):
     twist, vector = "geometry_msgs/msg/Twist", TYPES.types["geometry_msgs/msg/Vector3"]
     topic, values = field.split(".")[0], np.arange(200) // 20 % 3
     at = START + 10**7 * np.arange(200)
@@ -213,7 +213,7 @@ def test_a_speed_command_mapped_as_a_voltage_is_told(tmp_path, field, severity):
 
 
 @pytest.mark.parametrize("still", [False, True])
-def test_a_velocity_that_is_never_filled_in_is_left_out(tmp_path, still):
+def test_velocity_of_zero_during_motion_is_dropped(tmp_path, still):
     """UbiquityRobotics/ubiquity_motor issue 59: the position moves, the velocity is 0."""
     angle = np.zeros(N) if still else 0.01 * np.cumsum(SPEED)
     path = write(tmp_path / "log.csv", t=T, u=U, p=angle, w=0 * angle)

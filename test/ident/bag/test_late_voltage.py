@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A voltage that is recorded after it acts is moved back; one that leads its motion is not."""
+"""A voltage logged after it acts is moved back; one that leads its motion is not."""
 
 import time
 
@@ -19,8 +19,8 @@ DRIVES = {
 }
 
 
-def turned(voltage: np.ndarray, lag: float = 8.0, winding: float = 0.0) -> np.ndarray:
-    """Return the speed of a motor with dry friction at the rows' ends, 25 rad/s/V; lags in rows."""
+def simulate_speed(voltage: np.ndarray, lag: float = 8.0, winding: float = 0.0) -> np.ndarray:
+    """Return a motor's speed at the end of each row, with Coulomb friction; lags in rows."""
     speed, driven, out = 0.0, 0.0, []
     for volts in voltage:
         for _ in range(10):
@@ -30,16 +30,16 @@ def turned(voltage: np.ndarray, lag: float = 8.0, winding: float = 0.0) -> np.nd
     return np.array(out)
 
 
-def noisy(speed: np.ndarray, share: float = 0.01) -> np.ndarray:
+def add_noise(speed: np.ndarray, share: float = 0.01) -> np.ndarray:
     return speed + np.random.default_rng(3).normal(0, share * np.std(speed), speed.size)
 
 
 @pytest.mark.parametrize("drive", list(DRIVES))
 @pytest.mark.parametrize("rows", [2, 3, 10, 40])
-def test_the_rows_that_a_command_is_late_are_found(drive, rows):
+def test_delay_is_estimated_when_commands_are_logged_several_rows_late(drive, rows):
     if drive == "square" and rows > 10:
-        pytest.skip("of a square wave most of a half period late is as well the rest of it ahead")
-    speed = noisy(turned(DRIVES[drive]))
+        pytest.skip("a delay of most of a half period of a square wave equals a lead by the rest")
+    speed = add_noise(simulate_speed(DRIVES[drive]))
     assert find_late_rows(DRIVES[drive][rows:], speed[: N - rows]) == 0  # it leads
     assert find_late_rows(np.roll(DRIVES[drive], rows)[rows:], speed[rows:]) == rows
 
@@ -47,12 +47,12 @@ def test_the_rows_that_a_command_is_late_are_found(drive, rows):
 @pytest.mark.parametrize("drive", [*DRIVES, "sine"])
 @pytest.mark.parametrize("winding", [0.0, 2.0])
 @pytest.mark.parametrize("lag", [2.0, 50.0])
-def test_a_punctual_command_is_not_moved(drive, lag, winding):
+def test_command_logged_on_time_is_not_moved(drive, lag, winding):
     voltage = DRIVES.get(drive, 6 * np.sin(np.arange(N) * 2 * np.pi / 150))
-    assert find_late_rows(voltage, noisy(turned(voltage, lag, winding))) == 0
+    assert find_late_rows(voltage, add_noise(simulate_speed(voltage, lag, winding))) == 0
 
 
-def test_noise_fed_back_by_a_loop_does_not_move_the_command():
+def test_command_with_noise_feedback_is_not_moved():
     target, speed, rows = np.repeat(RNG.uniform(-100, 100, N // 50), 50), 0.0, []
     for k in range(N):
         measured = speed + RNG.normal(0, 3)
@@ -63,7 +63,7 @@ def test_noise_fed_back_by_a_loop_does_not_move_the_command():
     assert find_late_rows(voltage, measured) == 0
 
 
-def test_it_is_told_in_milliseconds():
+def test_delay_of_long_log_is_estimated_quickly():
     voltage = RNG.normal(size=20_000)
     find_late_rows(voltage[:500], voltage[:500])  # compiles
     begin = time.perf_counter()
@@ -72,9 +72,9 @@ def test_it_is_told_in_milliseconds():
 
 
 @pytest.mark.parametrize("motion", ["velocity", "count"])
-def test_a_late_column_is_moved_back_in_every_segment(tmp_path, motion):
+def test_late_voltage_is_moved_back_in_every_segment(tmp_path, motion):
     voltage, path = DRIVES["levels"], tmp_path / "log.csv"
-    speed = turned(voltage)
+    speed = simulate_speed(voltage)
     moved = speed if motion == "velocity" else np.rint(np.cumsum(speed) * 0.01 * 318)
     at = 0.01 * np.arange(N) + 60.0 * (np.arange(N) >= N // 2)
     late = np.concatenate([np.zeros(3), voltage[:-3]])

@@ -31,7 +31,7 @@ from smp_motor_ident.errors import BagError
         ("time=Timestamp(ms):ms", Signal("", "Timestamp(ms)", 1.0, 0.0, "ms")),
     ],
 )  # fmt: skip
-def test_a_signal_is_read_from_its_text(text, signal):
+def test_signal_is_parsed_from_text(text, signal):
     name = text.partition("=")[0]
     mapping = parse_mapping([text])
     signals = mapping.motors["motor"].signals if mapping.motors else mapping.defaults.signals
@@ -42,7 +42,7 @@ def test_a_signal_is_read_from_its_text(text, signal):
         assert getattr(found, name) == getattr(signal, name)
 
 
-def test_the_same_is_written_in_yaml_and_on_the_command_line(tmp_path):
+def test_yaml_and_command_line_mappings_are_equivalent(tmp_path):
     file = tmp_path / "map.yaml"
     file.write_text(
         "supply_voltage: 12\n"
@@ -89,7 +89,7 @@ def test_the_same_is_written_in_yaml_and_on_the_command_line(tmp_path):
         ("left.velocity=/a.b voltage=/c.d", "needs its wheel"),
     ],
 )
-def test_invalid_values_are_named_with_the_valid_ones(item, reason):
+def test_invalid_mapping_value_is_refused_with_valid_alternatives(item, reason):
     with pytest.raises(BagError) as refused:
         parse_mapping([item])
     assert reason in str(refused.value)
@@ -102,7 +102,7 @@ def test_invalid_values_are_named_with_the_valid_ones(item, reason):
      "motors: {left: {voltage: {topic: /a, field: b, unti: V}}}", "types: {a: 1}",
      ":\n  - {", "\tx: 1"],
 )  # fmt: skip
-def test_a_file_that_is_not_a_mapping_is_refused_by_its_name(tmp_path, text):
+def test_invalid_mapping_file_is_refused_by_name(tmp_path, text):
     file = tmp_path / "map.yaml"
     file.write_text(text)
     with pytest.raises(BagError, match=r"map\.yaml") as refused:
@@ -110,12 +110,12 @@ def test_a_file_that_is_not_a_mapping_is_refused_by_its_name(tmp_path, text):
     assert "\n" not in str(refused.value)
 
 
-def test_a_mapping_file_that_does_not_exist_is_named(tmp_path):
+def test_missing_mapping_file_is_refused_by_name(tmp_path):
     with pytest.raises(BagError, match=r"nothing\.yaml"):
         load_mapping(tmp_path / "nothing.yaml")
 
 
-def test_a_level_that_no_column_holds_is_written_in_the_mapping(tmp_path):
+def test_constant_voltage_is_given_in_mapping(tmp_path):
     path = tmp_path / "step_12V.csv"
     path.write_text("t,w\n" + "\n".join(f"{0.01 * k},{20 * k}" for k in range(30)))
     record = read_records(path, ["voltage=w*0+12 velocity=w time=t"])["motor"]
@@ -123,6 +123,6 @@ def test_a_level_that_no_column_holds_is_written_in_the_mapping(tmp_path):
 
 
 @pytest.mark.parametrize("name", ["a-b", "1", "a b", "ä", "a\n"])
-def test_a_wheel_needs_a_ros_name(name):
+def test_wheel_without_valid_ros_name_is_refused(name):
     with pytest.raises(BagError, match="is not a ROS name"):
         read_mapping({"motors": {name: {"voltage": "u", "velocity": "y"}}})

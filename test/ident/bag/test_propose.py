@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Proposed mappings have signals that behave according to their names, and can be read."""
+"""Mappings are proposed from field names confirmed by the data, and can be read."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -40,7 +40,7 @@ def write(path: Path, **columns: Sequence[float]) -> Path:
     return path
 
 
-def test_a_bag_of_two_wheels_is_mapped_and_the_pwms_full_scale_asked_for(tmp_path):
+def test_mapping_of_two_wheels_is_proposed_and_pwm_full_scale_requested(tmp_path):
     (u, y), (v, z) = motor(1), motor(2)
     twist, vector = "geometry_msgs/msg/Twist", TYPES.types["geometry_msgs/msg/Vector3"]
     at = START + np.rint(1e9 * T).astype(np.int64)
@@ -63,11 +63,11 @@ def test_a_bag_of_two_wheels_is_mapped_and_the_pwms_full_scale_asked_for(tmp_pat
         "right.voltage=/right/pwm.data:pwm",
         "right.velocity=/joint_states.velocity[right_wheel]",
     ]
-    assert asked(listing) == ["pwm_full_scale", "supply_voltage"]
+    assert list_requested_keys(listing) == ["pwm_full_scale", "supply_voltage"]
     given = [*listing.suggestion, "pwm_full_scale=32767", "supply_voltage=12"]
     records = read_records(tmp_path / "bag.mcap", given)
     np.testing.assert_allclose(records["right"].velocity, z)
-    # One step of 32767 ticks of 12 V.
+    # Resolution: 12 V / 32767.
     np.testing.assert_allclose(records["left"].voltage[1:], u[:-1], atol=12 / 32767)
 
 
@@ -81,17 +81,17 @@ def test_a_bag_of_two_wheels_is_mapped_and_the_pwms_full_scale_asked_for(tmp_pat
          ['voltage="u [mV]":mV', 'velocity="speed [rpm]":rpm']),
     ],
 )  # fmt: skip
-def test_names_of_other_languages_and_units_in_brackets_are_understood(tmp_path, names, suggestion):
+def test_names_in_other_languages_and_bracketed_units_are_recognised(tmp_path, names, suggestion):
     path = write(tmp_path / "log.csv", **dict(zip(names, (T, *motor(3)))))
     assert list_topics(path)[0].suggestion[:2] == suggestion
     assert len(read_records(path, list_topics(path)[0].suggestion)["motor"]) == N
 
 
-def asked(listing: Listing) -> list[str]:
+def list_requested_keys(listing: Listing) -> list[str]:
     return [text.partition("=")[0] for text in listing.asked]
 
 
-def chance() -> dict[str, np.ndarray]:
+def simulate_random_walks() -> dict[str, np.ndarray]:
     rng = np.random.default_rng(26)
     return {f"signal_{chr(97 + k)}": np.cumsum(rng.normal(0, 1, 32)) for k in range(16)}
 
@@ -101,57 +101,57 @@ OTHER = np.convolve(motor(12)[1], [0.0, 0.5, 0.5])[:N]
 NO_VOLTAGE, NO_MOTION = "no field is called a voltage", "no field is called a motion"
 NONE_EXPLAINS = "no field that is called a voltage explains one that is called a motion"
 PROPOSED = {
-    # Columns made of voltage and speed of a motor of this seed, and what is proposed of them.
+    # Seed of the motor, columns made of its voltage and speed, and the proposed mapping.
     "the voltage that explains the speed": (
         4, lambda u, w: dict(t=T, u_other=motor(5)[0], input_volts=u, omega=w),
         "voltage=input_volts velocity=omega time=t"),
-    "a duty": (13, lambda u, w: dict(t_ms=1e3 * T, duty=u / 6, w=w),
-               "voltage=duty:duty velocity=w time=t_ms:ms"),
-    "a duty of 100": (13, lambda u, w: dict(t_ms=1e3 * T, duty=u / 6 * 100, w=w),
-                      "voltage=duty:pwm velocity=w time=t_ms:ms"),
-    "a duty in pct": (13, lambda u, w: dict(t_ms=1e3 * T, duty_pct=u / 6 * 100, w=w),
-                      "voltage=duty_pct:% velocity=w time=t_ms:ms"),
-    "a duty in percent": (13, lambda u, w: dict(t_ms=1e3 * T, duty_percent=u / 6, w=w),
-                          "voltage=duty_percent:% velocity=w time=t_ms:ms"),
-    "a size with its direction": (14, lambda u, w: UNSIGNED | dict(dir=u > 0, w=w),
-                                  "voltage=u velocity=w direction=dir time=t"),
-    "a sign needs no direction": (14, lambda u, w: dict(t=T, u=u, dir=u > 0, w=w),
-                                  "voltage=u velocity=w time=t"),
-    "both without sign": (
+    "duty as fraction": (13, lambda u, w: dict(t_ms=1e3 * T, duty=u / 6, w=w),
+                         "voltage=duty:duty velocity=w time=t_ms:ms"),
+    "duty up to 100": (13, lambda u, w: dict(t_ms=1e3 * T, duty=u / 6 * 100, w=w),
+                       "voltage=duty:pwm velocity=w time=t_ms:ms"),
+    "duty_pct in percent": (13, lambda u, w: dict(t_ms=1e3 * T, duty_pct=u / 6 * 100, w=w),
+                            "voltage=duty_pct:% velocity=w time=t_ms:ms"),
+    "duty_percent as fraction": (13, lambda u, w: dict(t_ms=1e3 * T, duty_percent=u / 6, w=w),
+                                 "voltage=duty_percent:% velocity=w time=t_ms:ms"),
+    "unsigned voltage with direction": (14, lambda u, w: UNSIGNED | dict(dir=u > 0, w=w),
+                                        "voltage=u velocity=w direction=dir time=t"),
+    "signed voltage without direction": (14, lambda u, w: dict(t=T, u=u, dir=u > 0, w=w),
+                                         "voltage=u velocity=w time=t"),
+    "unsigned voltage and speed": (
         14, lambda u, w: UNSIGNED | dict(dir=np.where(u > 0, 1, 2), w=np.abs(w)),
         "voltage=u velocity=w time=t"),
-    "fractions are no counts": (15, lambda u, w: dict(t=T, u=u, encoder=np.cumsum(w) * 0.01),
-                                "voltage=u position=encoder time=t"),
-    "one voltage of two motors": (
+    "fractional encoder as position": (15, lambda u, w: dict(t=T, u=u, encoder=np.cumsum(w) * 0.01),
+                                       "voltage=u position=encoder time=t"),
+    "common voltage of two motors": (
         23, lambda u, w: dict(t=T, u=u, velL=w, velR=0.9 * w),
         "left.voltage=u left.velocity=velL right.voltage=u right.velocity=velR time=t"),
-    "a Vin that is switched": (24, lambda u, w: dict(time=T, Vin=u, taco=w),
-                               "voltage=Vin velocity=taco time=time"),
-    "the nearest word": (
+    "switched Vin": (24, lambda u, w: dict(time=T, Vin=u, taco=w),
+                     "voltage=Vin velocity=taco time=time"),
+    "nearest word of a dotted name": (
         25, lambda u, w: {"Vin_test.taco.time": T, "Vin_test.taco.values": w,
                           "Vin_test.Vin.values": u},
         'voltage="Vin_test.Vin.values" velocity="Vin_test.taco.values" time="Vin_test.taco.time"'),
-    "volts before their PWM, a speed before counts": (
+    "volts preferred to PWM, speed to count differences": (
         11, lambda u, w: dict(t=T, pwm=np.rint(u / 12 * 999), Voltage_V=np.round(u, 3),
                               Delta_Count=np.rint(w * 20), rpm=w),
         "voltage=Voltage_V velocity=rpm:rpm time=t"),
-    "counts in total": (
+    "accumulated counts": (
         11, lambda u, w: dict(t=T, pwm=np.rint(u / 12 * 999), Voltage_V=np.round(u, 3),
                               encoder=np.cumsum(np.rint(w * 20))),
         "voltage=Voltage_V count=encoder time=t"),
-    "a power before another wheel's speed": (
+    "power preferred to speed of another wheel": (
         12, lambda u, w: dict(t=T, powerPctLeft=np.rint(u * 10), vLeft=w, vRight=OTHER),
         "voltage=powerPctLeft:% velocity=vLeft time=t"),
-    "an angle that starts again at 360": (
+    "angle wrapping at 360 degrees": (
         13, lambda u, w: dict(t=T, volts=u, angle=np.rad2deg(np.cumsum(w) * 0.001) % 360),
         "voltage=volts position=angle:deg time=t"),
-    "a time is no voltage": (1, lambda u, w: dict(t=T, input=1e3 * T, pwm=u, speed=w),
-                             "voltage=pwm:pwm velocity=speed time=t"),
-    "a share of the battery is no speed": (
+    "time is not a voltage": (1, lambda u, w: dict(t=T, input=1e3 * T, pwm=u, speed=w),
+                              "voltage=pwm:pwm velocity=speed time=t"),
+    "normalised voltage is not a speed": (
         1, lambda u, w: dict(time=T, battery=0 * u + 12, autospeed=u / 12, voltage=u, velocity=w),
         "voltage=voltage velocity=velocity time=time"),
-    "a speed command is no voltage": (1, lambda u, w: dict(t=T, speed_cmd=20 * u, u=u, speed=w),
-                                      "voltage=u velocity=speed time=t"),
+    "speed command is not a voltage": (1, lambda u, w: dict(t=T, speed_cmd=20 * u, u=u, speed=w),
+                                       "voltage=u velocity=speed time=t"),
 }  # fmt: skip
 NOT_PROPOSED = [
     (6, lambda u, w: dict(t=T, voltage=u, temperature=motor(7)[1]), NO_MOTION),
@@ -166,7 +166,7 @@ NOT_PROPOSED = [
      NONE_EXPLAINS + "; dir: direction has the values 1, 2, and which is backwards is unknown"),
     (15, lambda u, w: dict(t=T, u=u, encoder_V=np.cumsum(w) * 0.01), NO_MOTION),
     (24, lambda u, w: dict(time=T, vin=12 - 0.01 * np.abs(w), taco=w), NO_VOLTAGE),
-    (26, lambda u, w: chance(), NO_VOLTAGE + " or a motion"),
+    (26, lambda u, w: simulate_random_walks(), NO_VOLTAGE + " or a motion"),
     (1, lambda u, w: dict(t=T, input=1e3 * T, speed=w), NONE_EXPLAINS),
     (1, lambda u, w: {"t": T, "pose.x": u, "pose.y": np.cumsum(w), "speed": w,
                       "motor_current": 0.3 * u}, NO_VOLTAGE),
@@ -177,17 +177,17 @@ NOT_PROPOSED = [
 
 
 @pytest.mark.parametrize("name", PROPOSED)
-def test_fields_that_behave_according_to_their_names_are_proposed(tmp_path, name):
+def test_mapping_is_proposed_when_data_confirm_field_names(tmp_path, name):
     seed, columns, items = PROPOSED[name]
     listing = list_topics(write(tmp_path / "log.csv", **columns(*motor(seed))))[0]
     assert " ".join(listing.suggestion) == items
     if "duty" in name:
         scale = ["pwm_full_scale"] if ":pwm" in items else []
-        assert asked(listing) == [*scale, "supply_voltage"]
+        assert list_requested_keys(listing) == [*scale, "supply_voltage"]
 
 
 @pytest.mark.parametrize(("seed", "columns", "remark"), NOT_PROPOSED)
-def test_nothing_is_proposed_where_no_voltage_moves_a_motion(tmp_path, seed, columns, remark):
+def test_no_mapping_is_proposed_when_no_voltage_explains_a_motion(tmp_path, seed, columns, remark):
     listing = list_topics(write(tmp_path / "log.csv", **columns(*motor(seed))))[0]
     assert listing.suggestion == [] and listing.remark.split(". ")[0] == remark
 
@@ -200,7 +200,7 @@ def test_nothing_is_proposed_where_no_voltage_moves_a_motion(tmp_path, seed, col
         pytest.param(100, 500, "changes 2 times only", id="on and off"),
     ],
 )
-def test_a_step_that_no_test_can_confirm_is_proposed_by_names(tmp_path, begin, end, remark):
+def test_mapping_of_step_response_is_proposed_by_names_alone(tmp_path, begin, end, remark):
     voltage = np.where((np.arange(N) >= begin) & (np.arange(N) < end), 12.0, 0.0)
     speed = 240 * (1 - np.exp(-np.maximum(T - T[begin], 0) / 0.1))
     speed += np.random.default_rng(8).normal(0, 5, N)
@@ -211,16 +211,16 @@ def test_a_step_that_no_test_can_confirm_is_proposed_by_names(tmp_path, begin, e
     assert len(read_records(path, listing.suggestion)["motor"]) == N
 
 
-def test_a_mapping_of_the_rim_asks_for_the_wheels_radius(tmp_path):
+def test_proposed_rim_speed_requests_wheel_radius(tmp_path):
     path = write(tmp_path / "log.csv", **dict(zip(("t", "u", "speed (m/s)"), (T, *motor(9)))))
     listing = list_topics(path)[0]
     assert listing.suggestion[1] == 'velocity="speed (m/s)":m/s'
-    assert asked(listing) == ["wheel_radius"]
+    assert list_requested_keys(listing) == ["wheel_radius"]
     assert len(read_records(path, [*listing.suggestion, "wheel_radius=0.05"])["motor"]) == N
 
 
-def test_electrical_revolutions_ask_for_the_pole_pairs(tmp_path):
-    """As VESC Tool logs them."""
+def test_proposed_electrical_speed_requests_pole_pairs(tmp_path):
+    """VESC Tool logs electrical speed."""
     voltage, speed = motor(9)
     path = write(tmp_path / "log.csv", ms_today=1e3 * T, duty_cycle=voltage / 12, erpm=speed)
     listing = list_topics(path)[0]
@@ -242,7 +242,9 @@ def test_electrical_revolutions_ask_for_the_pole_pairs(tmp_path):
         (("a", "b", "encoder"), ";", ["voltage=b:pwm", "count=encoder", "time=a"]),
     ],
 )
-def test_where_names_tell_too_little_the_data_do(tmp_path, names, separator, suggestion):
+def test_mapping_is_proposed_from_data_when_names_are_unclear(
+    tmp_path, names, separator, suggestion
+):
     voltage, speed = motor(10)
     columns = (10 * np.arange(N), np.rint(voltage / 6 * 255), np.rint(np.cumsum(speed) / 20))
     lines = [separator.join(f"{x:.0f}" for x in row) for row in zip(*columns)]
@@ -251,7 +253,7 @@ def test_where_names_tell_too_little_the_data_do(tmp_path, names, separator, sug
     listing = list_topics(path)[0]
     assert listing.suggestion == suggestion
     told = ["pwm_full_scale", "supply_voltage", "counts_per_revolution", "time"]
-    assert asked(listing) == told
+    assert list_requested_keys(listing) == told
     assert listing.remark.startswith("by the data alone")
     given = [*listing.suggestion[:2], suggestion[2] + ":ms", "pwm_full_scale=255 supply_voltage=6"]
     record = read_records(path, [*given, "counts_per_revolution=48"])["motor"]
@@ -259,11 +261,11 @@ def test_where_names_tell_too_little_the_data_do(tmp_path, names, separator, sug
     np.testing.assert_allclose(record.voltage[1:], voltage[:-1], atol=6 / 255)
 
 
-def test_the_interval_of_a_table_without_time_is_asked_for(tmp_path):
+def test_sample_time_of_table_without_time_is_requested(tmp_path):
     path = write(tmp_path / "log.csv", **dict(zip("uy", motor(12))))
     listing = list_topics(path)[0]
     assert listing.suggestion == ["voltage=u", "velocity=y"]
-    assert asked(listing) == ["velocity", "sample_time"]  # "w" would be in rad/s
+    assert list_requested_keys(listing) == ["velocity", "sample_time"]  # "w" would be in rad/s
     assert len(read_records(path, [*listing.suggestion, "sample_time=0.01"])["motor"]) == N
 
 
@@ -277,7 +279,7 @@ def test_the_interval_of_a_table_without_time_is_asked_for(tmp_path):
         (("t", "dutyIzquierda", "dutyDerecha", "velIzquierda", "velDerecha"), None),
     ],
 )
-def test_motors_are_told_apart_by_the_endings_of_names(tmp_path, names, wheels):
+def test_motors_are_distinguished_by_column_names(tmp_path, names, wheels):
     (u, y), (v, z) = motor(21), motor(22)
     path = write(tmp_path / "log.csv", **dict(zip(names, (T, u, v, y, z))))
     a, b = wheels or ("izquierda", "derecha")
@@ -308,7 +310,9 @@ def test_columns_of_one_length_are_listed_and_proposed_together(tmp_path):
         read_records(tmp_path / "lab.mat", ["voltage=limits", *items[1:]])
 
 
-def robot(space: str, efforts: np.ndarray, seed: int, drive: str = "pwm") -> list[object]:
+def make_robot_messages(
+    space: str, efforts: np.ndarray, seed: int, drive: str = "pwm"
+) -> list[object]:
     """Return the messages of one wheel: joint states with an effort, and its command."""
     voltage, speed = motor(seed)
     at = START + np.rint(1e9 * T).astype(np.int64)
@@ -321,7 +325,7 @@ def robot(space: str, efforts: np.ndarray, seed: int, drive: str = "pwm") -> lis
 
 
 def efforts(kind: str, seed: int = 1) -> np.ndarray:
-    """Return an effort of zeros, of none, or one that moves as a current does."""
+    """Return an effort of zeros, of NaN, or proportional to the current."""
     voltage, speed = motor(seed)
     current = 0.3 * (voltage - speed / 20)
     return {"zeros": np.zeros(N), "nan": np.full(N, np.nan), "current": current}[kind]
@@ -329,32 +333,32 @@ def efforts(kind: str, seed: int = 1) -> np.ndarray:
 
 @pytest.mark.parametrize("kind", ["zeros", "nan", "current"])
 @pytest.mark.parametrize("drive", ["pwm", "wheel_command"])
-def test_an_effort_is_not_proposed_in_place_of_the_drive(tmp_path, kind, drive):
-    sent = robot("", efforts(kind), 1, drive)
+def test_joint_effort_is_not_proposed_when_a_command_exists(tmp_path, kind, drive):
+    sent = make_robot_messages("", efforts(kind), 1, drive)
     listing = list_topics(write_mcap(tmp_path / "bag.mcap", sent))[0]
     assert listing.suggestion == [
         f"left.voltage=/{drive}.data:pwm",
         "left.velocity=/joint_states.velocity[left_wheel]",
     ]
-    assert asked(listing) == ["pwm_full_scale", "supply_voltage"]
+    assert list_requested_keys(listing) == ["pwm_full_scale", "supply_voltage"]
 
 
-def test_an_effort_that_explains_the_motion_better_than_a_slow_drive_is_not_proposed(tmp_path):
-    sent = robot("", efforts("current"), 1, "duty")
+def test_joint_effort_is_not_proposed_when_command_rate_is_low(tmp_path):
+    sent = make_robot_messages("", efforts("current"), 1, "duty")
     seldom = [s for s in sent if "duty" not in s.topic or s.stamp // 10**7 % 3 == 0]
     listing = list_topics(write_mcap(tmp_path / "bag.mcap", seldom))[0]
     assert listing.suggestion[0] == "left.voltage=/duty.data:pwm"
 
 
-def test_an_effort_that_alone_explains_the_motion_is_proposed_with_a_note(tmp_path):
-    sent = [s for s in robot("", motor(1)[0], 1) if "pwm" not in s.topic]
+def test_joint_effort_is_proposed_with_a_note_when_no_command_exists(tmp_path):
+    sent = [s for s in make_robot_messages("", motor(1)[0], 1) if "pwm" not in s.topic]
     listing = list_topics(write_mcap(tmp_path / "bag.mcap", sent))[0]
     assert listing.suggestion[0] == "left.voltage=/joint_states.effort[left_wheel]"
     assert "is a torque [N m] by its message's documentation" in listing.remark
 
 
-def test_every_robot_of_a_bag_is_proposed(tmp_path):
-    both = [m for k in (1, 2) for m in robot(f"/robot{k}", np.zeros(N), k)]
+def test_mapping_of_every_robot_in_bag_is_proposed(tmp_path):
+    both = [m for k in (1, 2) for m in make_robot_messages(f"/robot{k}", np.zeros(N), k)]
     path = write_mcap(tmp_path / "bag.mcap", sorted(both, key=lambda m: m.stamp))
     listing = list_topics(path)[0]
     assert listing.suggestion == [
@@ -371,7 +375,7 @@ def test_every_robot_of_a_bag_is_proposed(tmp_path):
 
 
 @pytest.mark.parametrize("column", ["position", "voltage"])
-def test_a_column_without_a_number_is_named(tmp_path, column):
+def test_column_without_numbers_is_reported(tmp_path, column):
     columns = {"t": T, "voltage": motor(1)[0], "position": np.cumsum(motor(1)[1])}
     path = write(tmp_path / "log.csv", **{**columns, column: np.full(N, np.nan)})
     listing = list_topics(path)[0]
@@ -382,7 +386,7 @@ def test_a_column_without_a_number_is_named(tmp_path, column):
 @pytest.mark.parametrize(
     "name", ["speed (rad/s)", "speed-2", 'a "fast" speed', "speed b=c", "v: speed", "/a.speed*2"]
 )
-def test_a_name_that_is_printed_is_accepted_back(tmp_path, name):
+def test_proposed_column_name_is_accepted_in_mapping(tmp_path, name):
     voltage, speed = motor(1)
     path = tmp_path / "my log.csv"
     quoted = '"' + name.replace('"', '""') + '"'

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Tables whose clock starts again hold several runs; rows that are merely late are sorted."""
+"""Tables whose clock restarts are split into runs; rows out of order are sorted."""
 
 from pathlib import Path
 
@@ -40,15 +40,15 @@ def codes(record: Record) -> list[str]:
 @pytest.mark.parametrize(
     "parts",
     [
-        pytest.param([run(300, 1), run(300, 2)], id="twice from zero"),
-        pytest.param([run(300, k) for k in range(9)], id="nine from zero"),
-        pytest.param([run(300, 1, 0.5), run(200, 2, 0.2), run(400, 3)], id="each from elsewhere"),
-        pytest.param([run(300, 1), run(8, 2), run(300, 3)], id="with a start that was given up"),
-        pytest.param([run(300, 1), run(300, 2, 2.9)], id="set back by a tenth of a second"),
-        pytest.param([run(60, 1), run(60, 2)], id="short ones"),
+        pytest.param([run(300, 1), run(300, 2)], id="two runs from zero"),
+        pytest.param([run(300, k) for k in range(9)], id="nine runs from zero"),
+        pytest.param([run(300, 1, 0.5), run(200, 2, 0.2), run(400, 3)], id="different start times"),
+        pytest.param([run(300, 1), run(8, 2), run(300, 3)], id="with an aborted run"),
+        pytest.param([run(300, 1), run(300, 2, 2.9)], id="clock set back by 0.1 s"),
+        pytest.param([run(60, 1), run(60, 2)], id="short runs"),
     ],
 )
-def test_runs_below_one_another_are_segments_of_their_own(tmp_path, parts):
+def test_concatenated_runs_become_segments(tmp_path, parts):
     record = read(tmp_path / "log.csv", np.concatenate(parts))
     lengths = [len(part) for part in parts]
     assert record.starts == tuple(np.cumsum([0, *lengths])[:-1].tolist())
@@ -59,8 +59,8 @@ def test_runs_below_one_another_are_segments_of_their_own(tmp_path, parts):
 
 
 @pytest.mark.parametrize("pause", [0.0, 60.0])
-def test_where_another_run_begins_no_voltage_is_answered(tmp_path, pause):
-    """Its first row has another voltage and another speed, and neither made the other."""
+def test_hold_of_voltage_is_not_inferred_from_changes_between_runs(tmp_path, pause):
+    """Voltage and speed both change at the first row of a run, without causal relation."""
     parts = [run(600, 6 + k, k * pause, hold=100) for k in range(3)]
     record = read(tmp_path / "log.csv", np.concatenate(parts))
     assert record.starts == (0, 600, 1200)
@@ -68,7 +68,7 @@ def test_where_another_run_begins_no_voltage_is_answered(tmp_path, pause):
 
 
 @pytest.mark.parametrize("slow", [60, 300])
-def test_runs_may_each_have_a_rate_of_their_own(tmp_path, slow):
+def test_runs_may_have_different_sample_rates(tmp_path, slow):
     rows = np.concatenate([run(600, 1), run(slow, 2) * [2, 1, 1]])
     record = read(tmp_path / "log.csv", rows)
     assert record.starts == (0, 600)
@@ -76,7 +76,7 @@ def test_runs_may_each_have_a_rate_of_their_own(tmp_path, slow):
     np.testing.assert_allclose(record.voltage[601:], rows[600:-1, 1], atol=1e-6)
 
 
-def test_a_run_that_was_cut_off_has_no_count_in_its_last_row(tmp_path):
+def test_incomplete_last_row_of_run_is_removed(tmp_path):
     parts = run(200, 1), run(300, 2)
     counts = [np.floor(50 * np.cumsum(STEP * part[:, 2])) for part in parts]
     lines = [
@@ -89,22 +89,22 @@ def test_a_run_that_was_cut_off_has_no_count_in_its_last_row(tmp_path):
     np.testing.assert_array_equal(np.diff(record.count[199:]), np.diff(counts[1]))
 
 
-@pytest.mark.parametrize("order", ["below one another", "in turn"])
+@pytest.mark.parametrize("order", ["concatenated", "interleaved"])
 @pytest.mark.parametrize(
     "column, names, motors",
     [
         ("motor_id", ("0", "1"), ("motor_0", "motor_1")),
         ("Wheel", ("L", "R"), ("L", "R")),
         ("joint name", ("front left", "rear left"), ("front_left", "rear_left")),
-        ("wheel", ("0", "1"), ("motor",)),  # a number of it, or its speed
+        ("wheel", ("0", "1"), ("motor",)),  # an ordinal number, or a speed
         ("motor", ("ON", "OFF"), ("motor",)),
         ("trial", ("a1", "a2"), ("motor",)),
     ],
 )
-def test_a_column_that_names_them_tells_motors_apart(tmp_path, order, column, names, motors):
+def test_motors_are_separated_by_identifying_column(tmp_path, order, column, names, motors):
     parts = [run(300, 1), run(300, 2)]
     rows = [(row, name) for part, name in zip(parts, names) for row in part]
-    if order == "in turn":
+    if order == "interleaved":
         rows = [rows[k + n] for k in range(300) for n in (0, 300)]
     text = [f"t,{column},u,w", *(f"{t:g},{name},{u:.6f},{w:.6f}" for (t, u, w), name in rows)]
     (tmp_path / "log.csv").write_text("\n".join(text))
@@ -116,43 +116,43 @@ def test_a_column_that_names_them_tells_motors_apart(tmp_path, order, column, na
             assert "several_motors" in codes(records[name])
 
 
-def test_a_gap_that_the_user_allows_does_not_join_runs(tmp_path):
+def test_gap_allowed_by_user_does_not_join_runs(tmp_path):
     rows = np.concatenate([run(300, 1), run(300, 2)])
     assert read(tmp_path / "log.csv", rows, [*MAP, "gap=30"]).starts == (0, 300)
 
 
-def test_slow_samples_keep_their_runs_apart(tmp_path):
+def test_runs_with_slow_sampling_are_separated(tmp_path):
     rows = np.concatenate([run(50, 1), run(50, 2)])
-    rows[:, 0] *= 50  # two a second
+    rows[:, 0] *= 50  # two samples per second
     assert read(tmp_path / "log.csv", rows).starts == (0, 50)
 
 
-def moved(rows: np.ndarray, row: int, to: int) -> np.ndarray:
+def move_row(rows: np.ndarray, row: int, to: int) -> np.ndarray:
     order = np.insert(np.delete(np.arange(len(rows)), row), to, row)
     return rows[order]
 
 
-def shuffled(rows: np.ndarray) -> np.ndarray:
+def shuffle_rows(rows: np.ndarray) -> np.ndarray:
     return np.random.default_rng(5).permutation(rows)
 
 
 @pytest.mark.parametrize(
     "late",
     [
-        pytest.param(lambda rows: moved(rows, 20, 23), id="a row that came late by little"),
-        pytest.param(lambda rows: moved(rows, 20, 250), id="a row that came late by much"),
-        pytest.param(lambda rows: moved(rows, 250, 20), id="a row that came early"),
-        pytest.param(lambda rows: moved(rows, 20, 299), id="a row at the end"),
+        pytest.param(lambda rows: move_row(rows, 20, 23), id="row late by 3 rows"),
+        pytest.param(lambda rows: move_row(rows, 20, 250), id="row late by 230 rows"),
+        pytest.param(lambda rows: move_row(rows, 250, 20), id="row early by 230 rows"),
+        pytest.param(lambda rows: move_row(rows, 20, 299), id="row moved to the end"),
         pytest.param(
             lambda rows: np.concatenate([rows[:50], rows[80:120], rows[50:80], rows[120:]]),
-            id="a block that was flushed late",
+            id="block flushed late",
         ),
         pytest.param(lambda rows: np.concatenate([rows[150:], rows[:150]]), id="halves swapped"),
-        pytest.param(lambda rows: rows[::-1], id="the newest first"),
-        pytest.param(shuffled, id="shuffled"),
+        pytest.param(lambda rows: rows[::-1], id="reversed order"),
+        pytest.param(shuffle_rows, id="shuffled"),
     ],
 )
-def test_rows_that_are_merely_out_of_order_are_sorted(tmp_path, late):
+def test_rows_out_of_order_are_sorted(tmp_path, late):
     rows = run(300, 4)
     record = read(tmp_path / "log.csv", late(rows))
     np.testing.assert_allclose(record.velocity, rows[:, 2], atol=1e-6)
@@ -161,7 +161,7 @@ def test_rows_that_are_merely_out_of_order_are_sorted(tmp_path, late):
     assert "clock_set_back" not in codes(record)
 
 
-def test_rows_that_are_there_twice_are_no_run_of_their_own(tmp_path):
+def test_duplicate_rows_are_not_a_separate_run(tmp_path):
     rows = run(300, 6)
     record = read(tmp_path / "log.csv", np.concatenate([rows[:200], rows[100:]]))
     np.testing.assert_allclose(record.velocity, rows[:, 2], atol=1e-6)
@@ -169,7 +169,7 @@ def test_rows_that_are_there_twice_are_no_run_of_their_own(tmp_path):
     assert "clock_set_back" not in codes(record)
 
 
-def test_rows_of_two_kinds_that_were_written_in_turn_are_no_runs():
+def test_alternating_blocks_of_two_signals_are_not_separate_runs():
     time = np.concatenate(
         [np.arange(50.0), np.arange(50.0), 50 + np.arange(50), 50 + np.arange(50)]
     )
@@ -178,8 +178,8 @@ def test_rows_of_two_kinds_that_were_written_in_turn_are_no_runs():
     assert split_into_runs(time, {"u": first, "w": second}) == [(0, 200)]
 
 
-def test_late_blocks_and_rows_do_not_hide_a_clock_that_starts_again():
-    """Each late block is held against what came since the last, so that many cost little."""
+def test_clock_restart_is_found_despite_late_blocks_and_rows():
+    """Each late block is compared only with rows since the last one, to bound the cost."""
     blocks = np.arange(20_000.0).reshape(-1, 20)
     late = blocks.reshape(-1, 2, 20)[:, ::-1].ravel()
     assert split_into_runs(late, {}) == [(0, late.size)]
@@ -189,7 +189,7 @@ def test_late_blocks_and_rows_do_not_hide_a_clock_that_starts_again():
     assert split_into_runs(twice, {}) == [(0, 20_000), (20_000, 40_000), (40_000, 60_000)]
 
 
-def test_two_tables_of_one_clock_start_again_together(tmp_path):
+def test_tables_with_common_clock_are_split_at_the_same_restart(tmp_path):
     parts = [run(300, 1), run(300, 2)]
     rows = np.concatenate(parts)
     files = [
@@ -202,7 +202,7 @@ def test_two_tables_of_one_clock_start_again_together(tmp_path):
     np.testing.assert_allclose(record.voltage[301:], rows[300:-1, 1], atol=1e-6)
 
 
-def test_two_tables_that_start_again_differently_are_refused(tmp_path):
+def test_tables_with_different_clock_restarts_are_refused(tmp_path):
     rows = np.concatenate([run(300, 1), run(300, 2)])
     files = [
         write(tmp_path / "set.csv", run(600, 3)[:, :2], "t,u"),
@@ -212,14 +212,14 @@ def test_two_tables_that_start_again_differently_are_refused(tmp_path):
         read_records(files, ["voltage=/set.u velocity=/state.w time=t"])
 
 
-def test_files_of_several_runs_are_joined_with_others(tmp_path):
+def test_file_of_several_runs_is_joined_with_other_files(tmp_path):
     two, one = np.concatenate([run(300, 1), run(300, 2)]), run(200, 3)
     paths = [write(tmp_path / "a.csv", two), write(tmp_path / "b.csv", one)]
     record = read_records(paths, MAP)["motor"]
     assert record.starts == (0, 300, 600)
 
 
-def test_several_runs_in_a_table_do_not_hide_the_voltage(tmp_path):
+def test_voltage_is_proposed_for_table_of_several_runs(tmp_path):
     rows = np.concatenate([run(300, k) for k in range(4)])
     path = write(tmp_path / "log.csv", rows)
     assert list_topics(path)[0].suggestion == ["voltage=u", "velocity=w", "time=t"]

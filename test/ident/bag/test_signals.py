@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Any numeric field of any message becomes a signal in SI at the motor shaft."""
+"""Any numeric field of any message is read as a signal in SI units at the motor shaft."""
 
 import math
 from typing import Any
@@ -36,7 +36,7 @@ def every_10_ms(topic: str, values: Any) -> list[Sent]:
 
 
 def joint_states(names: Any, velocities: Any, frames: Any = None) -> list[Sent]:
-    """``names(k)`` are the joints of message k, ``velocities[k]`` their speeds."""
+    """Return messages with the joints ``names(k)`` and their speeds ``velocities[k]``."""
     times = [START + k * STEP for k in range(len(velocities))]
     return [
         joint_state(at, names(k), velocities[k], header=header(at, frames(k) if frames else ""))
@@ -48,7 +48,7 @@ MAP = ["voltage=/pwm.data*12/255", "velocity=/joint_states.velocity[left_wheel_j
 
 
 @pytest.mark.parametrize("storage", ["mcap", "db3"])
-def test_pwm_counts_and_the_joint_of_a_name(tmp_path, storage):
+def test_pwm_counts_and_named_joint_are_read(tmp_path, storage):
     n = 100
     rng = np.random.default_rng(0)
     pwm = rng.integers(-255, 256, n)
@@ -61,11 +61,11 @@ def test_pwm_counts_and_the_joint_of_a_name(tmp_path, storage):
     path = write(tmp_path / f"bag.{storage}", messages)
     record = read_records(path, MAP)["motor"]
     np.testing.assert_array_equal(record.velocity, speed[:, 1])
-    # Both have the same instants, and a command holds from its own on.
+    # Both have the same stamps, and a command holds from its stamp on.
     np.testing.assert_allclose(record.voltage[1:], pwm[:-1] * 12 / 255, rtol=1e-15)
 
 
-def test_names_may_change_their_order_and_be_missing(tmp_path):
+def test_joint_is_found_when_names_are_reordered_or_missing(tmp_path):
     n = 90
     rng = np.random.default_rng(1)
     pwm = rng.integers(-255, 256, n)
@@ -87,7 +87,7 @@ def test_names_may_change_their_order_and_be_missing(tmp_path):
     np.testing.assert_array_equal(record.velocity, left[np.arange(n) % 3 < 2])
 
 
-def test_a_topic_whose_every_message_is_laid_out_otherwise_is_read(tmp_path):
+def test_topic_with_varying_message_layout_is_read(tmp_path):
     n = 150
     values = np.random.default_rng(2).normal(size=n)
     messages = in_order(
@@ -220,7 +220,7 @@ def test_types_defined_in_the_bag_are_used(tmp_path):
         ("VelocityRadPerSec.data", 1.0),
     ],
 )  # fmt: skip
-def test_a_message_whose_name_ends_in_a_unit_is_in_that_unit(tmp_path, signal, factor):
+def test_unit_is_inferred_from_end_of_topic_name(tmp_path, signal, factor):
     values = np.sin(np.arange(50.0))
     topic = "/" + signal.partition(".")[0]
     sent = in_order(every_10_ms("/u", values), every_10_ms(topic, values))
@@ -229,7 +229,7 @@ def test_a_message_whose_name_ends_in_a_unit_is_in_that_unit(tmp_path, signal, f
     np.testing.assert_allclose(record.velocity, factor * values, rtol=1e-12)
 
 
-def test_the_speed_of_a_body_is_divided_by_the_wheels_radius(tmp_path):
+def test_body_speed_is_divided_by_wheel_radius(tmp_path):
     """``geometry_msgs/Twist`` and ``Pose`` are in m/s and m (REP 103)."""
     twist, vector = "geometry_msgs/msg/Twist", TYPES.types["geometry_msgs/msg/Vector3"]
     values = np.sin(np.arange(50.0))
@@ -243,7 +243,7 @@ def test_the_speed_of_a_body_is_divided_by_the_wheels_radius(tmp_path):
     np.testing.assert_allclose(record.velocity, values / 0.05, rtol=1e-12)
 
 
-def test_a_duty_cycle_times_the_supply_as_it_was_measured(tmp_path):
+def test_duty_cycle_is_multiplied_by_measured_supply_voltage(tmp_path):
     n = 50
     duty = np.linspace(-1, 1, n)
     supply = np.linspace(12.6, 11.4, n)
@@ -262,7 +262,7 @@ def test_a_duty_cycle_times_the_supply_as_it_was_measured(tmp_path):
         read_records(path, ["voltage=/duty.data:duty velocity=/speed.data"])
 
 
-def test_units_scales_and_shafts_come_out_in_si_at_the_motor(tmp_path):
+def test_velocity_is_converted_to_si_units_at_motor_shaft(tmp_path):
     messages = in_order(every_10_ms("/u", [1.0] * 9), every_10_ms("/w", [60.0] * 9))
     path = write_mcap(tmp_path / "bag.mcap", messages)
 
@@ -295,7 +295,7 @@ def test_units_scales_and_shafts_come_out_in_si_at_the_motor(tmp_path):
         ("voltage=/u.data velocity=/w.data clock=header", "no usable header time"),
     ],
 )
-def test_an_unfit_mapping_is_refused_with_the_available_fields(tmp_path, mapping, reason):
+def test_invalid_mapping_is_refused_with_available_fields(tmp_path, mapping, reason):
     messages = in_order(every_10_ms("/u", [1.0] * 9), every_10_ms("/w", [60.0] * 9))
     path = write_mcap(tmp_path / "bag.mcap", messages)
     with pytest.raises(BagError) as refused:
@@ -304,7 +304,7 @@ def test_an_unfit_mapping_is_refused_with_the_available_fields(tmp_path, mapping
     assert "bag.mcap" in str(refused.value)
 
 
-def test_messages_that_are_not_of_their_type_are_left_out_and_told(tmp_path):
+def test_messages_not_matching_their_type_are_removed_and_reported(tmp_path):
     truth = motion(n=100)
     messages = truth.messages()
     messages[50] = Sent(messages[50].topic, STATE, messages[50].stamp, b"\0\1\0\0rubbish")
@@ -345,7 +345,7 @@ def test_our_own_messages_need_no_mapping(tmp_path):
     assert (given.gear_ratio, given.resistance, given.encoder_bits) == (10.0, 1.5, 16)
 
 
-def test_a_missing_description_is_told(tmp_path):
+def test_missing_motor_description_is_reported(tmp_path):
     messages = motion(n=20).messages(description=False)
     record = read_records(write_mcap(tmp_path / "bag.mcap", messages))["front_left"]
     assert "no motor_description; a gear ratio of 1 is assumed" in notes(record)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Time: which clock, order, losses, gaps, wrap-around and held inputs."""
+"""Choice of clock, order of samples, losses, gaps, wrap-around and held inputs."""
 
 from dataclasses import replace
 
@@ -26,21 +26,21 @@ from smp_motor_ident.bag import join_records, read_records
 from smp_motor_ident.bag.clock import average_held_input, fit_clock
 from smp_motor_ident.errors import BagError
 
-# Without shrinking, which takes minutes where an example is a whole bag.
-MANY = settings(max_examples=25, deadline=None, suppress_health_check=list(HealthCheck),
+# Without shrinking, which takes minutes when an example is a whole bag.
+BAG_SETTINGS = settings(max_examples=25, deadline=None, suppress_health_check=list(HealthCheck),
                 phases=(Phase.explicit, Phase.reuse, Phase.generate))  # fmt: skip
 
 
-@MANY
+@BAG_SETTINGS
 @given(data=st.data())
-def test_any_sequence_of_states_reads_back_as_it_was_written(tmp_path_factory, data):
+def test_written_states_are_read_back_unchanged(tmp_path_factory, data):
     n = data.draw(st.integers(2, 60))
     finite = st.floats(-1e12, 1e12)
-    # A speed of zero throughout, while the counts go on, was never filled in, and is left out.
+    # A velocity of zero throughout, while the count moves, is dropped as never filled in.
     column = st.lists(finite, min_size=n, max_size=n).map(np.array).filter(np.any)
-    # Any intervals between half and one and a half of each other: no gap, no loss.
+    # All intervals differ by a factor of 1.5 at most: no gap, no lost sample.
     steps = data.draw(st.lists(st.integers(8_000_000, 12_000_000), min_size=n, max_size=n))
-    # A counter that stays at an end of its range is full, and refused.
+    # A counter that stays at an end of its range is saturated, and refused.
     ends = {end for k in range(7, 63) for end in (2**k - 1, -(2**k))}
     count = st.integers(-(2**62), 2**62).filter(lambda c: c not in ends)
     counts = data.draw(st.lists(count, min_size=n, max_size=n))
@@ -55,9 +55,9 @@ def test_any_sequence_of_states_reads_back_as_it_was_written(tmp_path_factory, d
     assert_read(read_records(bag)["rear_right"], truth)
 
 
-@MANY
+@BAG_SETTINGS
 @given(order=st.permutations(range(50)), storage=st.sampled_from(["mcap", "db3"]))
-def test_shuffled_samples_are_sorted_and_that_is_told(tmp_path_factory, order, storage):
+def test_shuffled_samples_are_sorted_and_reported(tmp_path_factory, order, storage):
     truth = motion(n=50)
     messages = truth.messages(description=False)
     description = truth.messages()[:1]
@@ -70,8 +70,8 @@ def test_shuffled_samples_are_sorted_and_that_is_told(tmp_path_factory, order, s
     assert ("out of order" in notes(record)) is shuffled
 
 
-def test_a_mean_voltage_over_a_long_interval_of_irregular_samples_begins_a_segment(tmp_path):
-    """The mean does not tell when within 0.4 s, where 10 ms are usual, the voltage changed."""
+def test_long_gap_between_irregular_samples_begins_a_segment(tmp_path):
+    """The mean voltage over 0.4 s does not give the time of its changes."""
     truth = motion(n=200)
     steps = np.where(np.arange(200) % 3, 10_000_000, 19_000_000)
     steps[120] = 400_000_000
@@ -81,7 +81,7 @@ def test_a_mean_voltage_over_a_long_interval_of_irregular_samples_begins_a_segme
     assert "1 gaps of up to 0.4 s" in notes(record)
 
 
-def test_a_few_lost_samples_are_bridged_and_more_begin_a_segment(tmp_path):
+def test_short_gaps_are_bridged_and_long_gaps_begin_a_segment(tmp_path):
     truth = motion(n=400)
     ramp = np.linspace(-10, 10, 400)
     truth = replace(truth, voltage=ramp)
@@ -103,7 +103,7 @@ def test_a_few_lost_samples_are_bridged_and_more_begin_a_segment(tmp_path):
     np.testing.assert_array_equal(record.voltage[untouched], ramp[kept][untouched])
 
 
-def test_late_samples_are_not_taken_for_lost_ones(tmp_path):
+def test_late_samples_are_not_counted_as_lost(tmp_path):
     truth = motion(n=400)
     time = truth.time.copy()
     # A stall of four periods, after which the sampler catches up in a burst.
@@ -116,7 +116,7 @@ def test_late_samples_are_not_taken_for_lost_ones(tmp_path):
     assert "missing" not in notes(record)
 
 
-def test_duplicates_are_left_out_and_told(tmp_path):
+def test_duplicate_samples_are_removed_and_reported(tmp_path):
     truth = motion(n=100)
     messages = truth.messages()
     record = read(tmp_path / "bag.mcap", [*messages, *messages[40:60]])
@@ -124,7 +124,7 @@ def test_duplicates_are_left_out_and_told(tmp_path):
     assert "20 samples with a repeated time were left out (duplicates)" in notes(record)
 
 
-def test_samples_without_a_voltage_are_left_out_and_told(tmp_path):
+def test_samples_without_voltage_are_removed_and_reported(tmp_path):
     truth = motion(n=100)
     voltage, current = truth.voltage.copy(), np.full(100, np.nan)
     voltage[[10, 40]] = np.nan, np.inf
@@ -140,7 +140,7 @@ def test_samples_without_a_voltage_are_left_out_and_told(tmp_path):
 
 
 @pytest.mark.parametrize("days", [0, 3, -3])
-def test_header_stamps_days_away_from_the_log_are_used_and_that_is_told(tmp_path, days):
+def test_header_stamps_days_off_the_log_times_are_used_and_reported(tmp_path, days):
     truth = motion(n=100)
     record = read(tmp_path / "bag.mcap", truth.messages(latency=days * 86_400 * 10**9 + 7))
     assert_read(record, truth)
@@ -148,7 +148,7 @@ def test_header_stamps_days_away_from_the_log_are_used_and_that_is_told(tmp_path
     assert (f"{days * 86400:+d}.000000 s from the header's" in notes(record)) is bool(days)
 
 
-def test_stamps_that_are_not_set_are_not_the_time(tmp_path):
+def test_log_times_are_used_when_header_stamps_are_not_set(tmp_path):
     truth = motion(n=100)
     unset = replace(truth, time=np.zeros(100, np.int64))
     messages = [
@@ -160,7 +160,7 @@ def test_stamps_that_are_not_set_are_not_the_time(tmp_path):
     assert "time: log times (the header stamps are not set)" in notes(record)
 
 
-def test_a_clock_that_was_set_back_begins_a_new_segment(tmp_path):
+def test_clock_set_back_begins_a_segment(tmp_path):
     truth = motion(n=200)
     stamps = truth.time.copy()
     stamps[100:] -= 3_600 * 10**9
@@ -174,7 +174,7 @@ def test_a_clock_that_was_set_back_begins_a_new_segment(tmp_path):
     assert "set back 1 times" in notes(record)
 
 
-def test_a_stamped_output_meets_an_unstamped_input_by_offset_and_drift(tmp_path):
+def test_stamped_output_and_unstamped_input_are_aligned_by_offset_and_drift(tmp_path):
     rng = np.random.default_rng(5)
     n, drift, offset = 3000, 50e-6, 12_345.678
     sampled = np.arange(n) * 0.01  # the microcontroller's clock
@@ -187,7 +187,7 @@ def test_a_stamped_output_meets_an_unstamped_input_by_offset_and_drift(tmp_path)
         )
         for k in range(n)
     ]  # fmt: skip
-    # The input is its own time, so that an error of alignment is an error of voltage.
+    # The input's value is its time, so that a misalignment appears as a voltage error.
     input_times = np.arange(n // 2) * 0.02 + offset
     stamps = START + np.rint(input_times * 1e9).astype(np.int64)
     messages = in_order(messages, floats("/u", stamps, input_times))
@@ -197,11 +197,11 @@ def test_a_stamped_output_meets_an_unstamped_input_by_offset_and_drift(tmp_path)
     # Mean of the held value over the interval: at most one input period old, never in the future
     lag = record.velocity - record.voltage
     assert lag.min() >= 0.0
-    # Half an output period plus up to one input period, plus latency that cannot be known.
+    # Half an output period plus up to one input period, plus unknown latency.
     assert lag.max() < 0.005 + 0.02 + 0.001
 
 
-def test_offset_and_drift_are_found_below_the_latency():
+def test_clock_offset_and_drift_are_estimated_despite_latency():
     rng = np.random.default_rng(6)
     stamp = np.arange(60_000, dtype=np.int64) * 1_000_000
     latency = rng.exponential(2_000_000, stamp.size).astype(np.int64)
@@ -212,7 +212,7 @@ def test_offset_and_drift_are_found_below_the_latency():
     assert fit.drift == pytest.approx(100e-6, abs=1e-6)
 
 
-@MANY
+@BAG_SETTINGS
 @given(data=st.data(), held=st.sampled_from(["after", "before"]))
 def test_a_held_input_is_averaged_over_each_interval(data, held):
     increasing = st.sets(st.integers(0, 1000), min_size=2, max_size=30).map(sorted)
@@ -223,7 +223,7 @@ def test_a_held_input_is_averaged_over_each_interval(data, held):
     if at.size < 2:
         return
     found = average_held_input(time, value, held, at)
-    # By brute force, millisecond by millisecond.
+    # Reference: the mean over a grid of 1 ms.
     grid = np.arange(1_000_000, 1_001_000_000, 1_000_000)  # ends of the milliseconds
     if held == "after":
         level = value[np.maximum(np.searchsorted(time, grid - 1_000_000, "right") - 1, 0)]
@@ -235,7 +235,7 @@ def test_a_held_input_is_averaged_over_each_interval(data, held):
         assert found[k] == pytest.approx(level[inside].mean(), abs=1e-9)
 
 
-def test_samples_before_the_first_command_are_left_out(tmp_path):
+def test_samples_before_first_command_are_removed(tmp_path):
     times = START + np.arange(100) * 10_000_000
     messages = in_order(floats("/w", times, np.arange(100)), floats("/u", times[30:], np.ones(70)))
     record = read(tmp_path / "bag.mcap", messages, "voltage=/u.data velocity=/w.data")
@@ -243,7 +243,7 @@ def test_samples_before_the_first_command_are_left_out(tmp_path):
     assert "30 samples before the first voltage were left out" in notes(record)
 
 
-def test_an_input_that_stops_ends_the_record_there(tmp_path):
+def test_interruption_of_input_ends_the_segment(tmp_path):
     times = START + np.arange(200) * 10_000_000
     on = np.r_[0:60, 140:200]
     messages = in_order(floats("/w", times, np.arange(200)), floats("/u", times[on], np.ones(120)))
@@ -252,7 +252,7 @@ def test_an_input_that_stops_ends_the_record_there(tmp_path):
     assert len(record.starts) == 2
 
 
-def test_outputs_of_several_topics_come_onto_one_axis(tmp_path):
+def test_outputs_of_several_topics_are_interpolated_to_common_times(tmp_path):
     fast = START + np.arange(400) * 5_000_000
     slow = START + np.arange(200) * 10_000_000 + 1_000_000
     messages = in_order(
@@ -269,7 +269,7 @@ def test_outputs_of_several_topics_come_onto_one_axis(tmp_path):
     assert "velocity: interpolated" in notes(record)
 
 
-def test_an_angle_that_wraps_at_a_turn_is_unwrapped(tmp_path):
+def test_angle_wrapping_at_one_turn_is_unwrapped(tmp_path):
     times = START + np.arange(300) * 10_000_000
     angle = np.arange(300) * 7.0
     messages = in_order(floats("/u", times, np.ones(300)), floats("/angle", times, angle % 360))
@@ -285,7 +285,7 @@ def test_recordings_of_different_gearboxes_are_not_joined(tmp_path):
         join_records([record, other])
 
 
-def test_signals_of_only_some_recordings_are_kept_there(tmp_path):
+def test_signal_missing_in_one_recording_is_nan_after_joining(tmp_path):
     record = read(tmp_path / "bag.mcap", motion(n=20).messages())
     other = replace(record, current=None)
     joined = join_records([record, other])
@@ -294,7 +294,7 @@ def test_signals_of_only_some_recordings_are_kept_there(tmp_path):
     assert np.all(np.diff(joined.time) > 0)
 
 
-def test_a_recording_knows_when_it_began_where_its_clock_was_set(tmp_path):
+def test_recording_date_is_given_only_if_clock_was_set(tmp_path):
     truth = motion()
     (record,) = read_records(write_mcap(tmp_path / "a.mcap", truth.messages())).values()
     assert record.recorded == pytest.approx(1e-9 * START, abs=1.0)
@@ -305,7 +305,7 @@ def test_a_recording_knows_when_it_began_where_its_clock_was_set(tmp_path):
 
 
 @pytest.mark.parametrize("years", [0.01, 1.0, 56.0])
-def test_a_clock_that_is_set_forward_begins_a_segment_and_costs_no_time(tmp_path, years):
+def test_clock_set_forward_begins_a_segment_and_adds_no_duration(tmp_path, years):
     truth = motion(n=400)
     leap = round(years * 365.25 * 86_400) * 10**9
     time = truth.time - START
@@ -318,7 +318,7 @@ def test_a_clock_that_is_set_forward_begins_a_segment_and_costs_no_time(tmp_path
     assert found.evidence["longest"] == pytest.approx(leap * 1e-9, rel=1e-6)
 
 
-def test_offsets_between_topics_are_kept_where_the_clock_is_set(tmp_path):
+def test_topics_stay_aligned_when_clock_is_set_forward(tmp_path):
     k, leap = np.arange(400), 10**18
     at = START + 10**7 * k + leap * (k >= 200)
     sent = in_order(floats("/u", at, k // 20 % 3), floats("/w", at, np.sin(0.1 * k)))

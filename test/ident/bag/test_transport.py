@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The delay of a loop, measured from bags of loops whose delay is known."""
+"""Measurement of the loop delay from bags of loops with a known delay."""
 
 import json
 from dataclasses import replace
@@ -18,11 +18,11 @@ COMMAND = "smp_interfaces/msg/MotorCommand"
 PERIOD = 5_000_000
 """[ns]"""
 FINE = 10_000
-"""Grid on which the applied voltage is put together [ns]."""
+"""Time grid of the applied voltage [ns]."""
 
 
-def driven_bag(path: Path, arrival: np.ndarray, *, latch: bool, answering: bool = True) -> Path:
-    """Write the bag of a loop whose command ``k`` arrives ``arrival[k]`` ns after sample ``k``."""
+def write_loop_bag(path: Path, arrival: np.ndarray, *, latch: bool, answering: bool = True) -> Path:
+    """Write a bag of a loop whose command ``k`` arrives ``arrival[k]`` ns after sample ``k``."""
     rng = np.random.default_rng(7)
     one = motion(arrival.size, step=PERIOD)
     wanted = rng.uniform(-6, 6, arrival.size)
@@ -45,14 +45,14 @@ def driven_bag(path: Path, arrival: np.ndarray, *, latch: bool, answering: bool 
 
 
 def arrivals(n: int = 600) -> np.ndarray:
-    """Return 1.2 ms and an exponential tail of 0.3 ms, on the fine grid."""
+    """Return delays of 1.2 ms plus an exponential tail of 0.3 ms, on the fine grid."""
     late = 1.2e6 + np.random.default_rng(3).exponential(0.3e6, n)
     return (late / FINE).astype(np.int64) * FINE
 
 
-def test_driver_that_applies_on_arrival_tells_its_delay(tmp_path):
+def test_delay_of_driver_that_applies_commands_on_arrival_is_measured(tmp_path):
     arrival = arrivals()
-    found = measure_delay(driven_bag(tmp_path / "a.mcap", arrival, latch=False))["front_left"]
+    found = measure_delay(write_loop_bag(tmp_path / "a.mcap", arrival, latch=False))["front_left"]
     assert not found.latched
     assert found.answers == 600
     # One delay for all, within the spread of the tail and one trial step (0.25 ms).
@@ -61,36 +61,36 @@ def test_driver_that_applies_on_arrival_tells_its_delay(tmp_path):
     assert found.until_applied(0.002) == (found.usual, found.longest)
 
 
-def test_driver_that_waits_for_its_next_sample_is_recognised(tmp_path):
-    found = measure_delay(driven_bag(tmp_path / "a.mcap", arrivals(), latch=True))["front_left"]
+def test_driver_that_latches_commands_at_its_next_sample_is_recognised(tmp_path):
+    found = measure_delay(write_loop_bag(tmp_path / "a.mcap", arrivals(), latch=True))["front_left"]
     assert found.latched
     assert found.until_applied(0.005) == (0.005, 0.005)
-    # At a rate at which the tail misses the next sample it is two.
+    # At a faster rate the tail misses the next sample, and the delay is two samples.
     assert found.until_applied(0.0018) == (0.0018, 0.0036)
 
 
-def test_few_late_commands_do_not_set_the_delay(tmp_path):
+def test_few_late_commands_do_not_affect_the_delay(tmp_path):
     arrival = arrivals()
-    arrival[200:220] += 200_000_000  # the machine stood still for a tenth of a second
-    found = measure_delay(driven_bag(tmp_path / "a.mcap", arrival, latch=False))["front_left"]
+    arrival[200:220] += 200_000_000  # a stall of the machine
+    found = measure_delay(write_loop_bag(tmp_path / "a.mcap", arrival, latch=False))["front_left"]
     assert found.longest < 0.005
 
 
-def test_bag_whose_commands_answer_nothing_is_refused(tmp_path):
-    bag = driven_bag(tmp_path / "a.mcap", arrivals(), latch=False, answering=False)
+def test_bag_whose_commands_answer_no_state_is_refused(tmp_path):
+    bag = write_loop_bag(tmp_path / "a.mcap", arrivals(), latch=False, answering=False)
     with pytest.raises(BagError, match="no wheel with 50 motor_command that answer"):
         measure_delay(bag)
 
 
 def test_tune_designs_for_the_delay_of_a_bag_and_reports_it(tmp_path, capsys):
-    bag = driven_bag(tmp_path / "a.mcap", arrivals() + 6_000_000, latch=False)
+    bag = write_loop_bag(tmp_path / "a.mcap", arrivals() + 6_000_000, latch=False)
     output = tmp_path / "gains.yaml"
     assert tune([str(MOTORS), "--bag", str(bag), "--output", str(output)]) == 0
     loops = json.loads((tmp_path / "gains.json").read_text())["wheels"]
     found = measure_delay(bag)["front_left"]
     assert loops["front_left"]["loop"]["delay"] == pytest.approx(found.longest)
     assert loops["front_left"]["loop"]["usual_delay"] == pytest.approx(found.usual)
-    # The bag holds one wheel; the others have what every loop has without a bag.
+    # The bag holds one wheel; the others have the default delay.
     assert loops["rear_left"]["loop"]["delay"] == 0.005
     for text in (capsys.readouterr().out, output.read_text()):
         assert "600 commands of" in text
