@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The client of a robot that is there and whose wheel reports, for tests of commissioning."""
+"""A fake client of a connected robot with one reporting wheel, for tests of commissioning."""
 
 import contextlib
 

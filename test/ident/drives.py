@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A drive as it was identified, and the answer of a true one by an integration of our own."""
+"""An identified drive, and the response of the true one by independent integration."""
 
 import math
 
@@ -32,7 +32,7 @@ def estimate(std: float = 0.01, findings=(), **more) -> Estimate:
 
 
 def change(one, motor, window=0.0, lag=0.0, share=0.5, seconds=2.0):
-    """Return time and speed of a change of set-point, integrated in small steps.
+    """Return time and relative speed of a set-point change, integrated in small steps.
 
     The controller is written from the published rules of the running one; friction acts on the
     voltage's side.

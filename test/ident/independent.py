@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A motor of its own for the tests: fixed small steps, shares nothing with the estimator."""
+"""An independent motor simulator: fixed small steps, no code shared with the estimator."""
 
 import numba
 import numpy as np

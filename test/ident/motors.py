@@ -43,7 +43,7 @@ def check(found, truth, names=None, *, sigmas=4.0, floor=0.0, most=None, total=F
 
 
 def first_order(voltage, gain, tau, step):
-    """Return the exact speed, from rest, under voltages that ran before their rows."""
+    """Return the exact speed, from rest, under voltages held over the interval before each row."""
     keep = np.exp(-step / tau)
     return np.r_[0.0, lfilter([1 - keep], [1.0, -keep], gain * voltage[1:])]
 

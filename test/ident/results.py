@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A result of identification as the tests of reports and documents need it."""
+"""Identification results for the tests of reports and documents."""
 
 import numpy as np
 
@@ -30,12 +30,12 @@ ALIKE = Finding("alike", "warning", "The delay & the inductance look alike at 10
 
 
 def correlation(*values: float) -> Correlation:
-    """With a band of 0.1."""
+    """Return a correlation with a band of 0.1."""
     return Correlation(np.arange(1.0, 1 + len(values)), np.array(values), 0.1)
 
 
 def comparison(role: str, seconds: float = 20.0, begin: float = 0.0) -> Comparison:
-    """Return a speed that follows a square of the voltage, under white noise."""
+    """Return a comparison under a square-wave voltage, with white noise on the speed."""
     rng = np.random.default_rng(7)
     time = np.arange(begin, begin + seconds, 0.005)
     voltage = 8 * np.sign(np.sin(2 * np.pi * 0.37 * time))
@@ -53,7 +53,7 @@ def tuning_of_two(monkeypatch, one: Estimate) -> tuning_page.Tuning:
 
 
 def estimate(wheel: str = "front_left", *, current: bool = True) -> Estimate:
-    """One motor's result, with current measured or from voltage and speed alone."""
+    """Return one motor's result, with measured current or from voltage and speed alone."""
     known = {n: Quantity(v, v / 100, (0.98 * v, 1.02 * v), u) for n, (v, u) in PHYSICAL.items()}
     hidden = {n: Quantity(None, unit=u, status="unidentifiable") for n, (_, u) in PHYSICAL.items()}
     combinations = {

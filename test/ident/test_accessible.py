@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The pages for people who see little or use no mouse: judged by axe-core in a browser."""
+"""Accessibility of the pages, checked by axe-core in a browser."""
 
 import numpy as np
 import pytest
@@ -16,7 +16,7 @@ pytestmark = pytest.mark.skipif(not CHROMIUM, reason="no Chromium on this machin
 
 
 def report(monkeypatch: pytest.MonkeyPatch) -> str:
-    """Of two motors, one with a tuning page, and one that failed."""
+    """Return a report of two motors, one with a tuning page, and of a failed wheel."""
     one, other = estimate(), estimate("rear_right", current=False)
     return render(
         Report(
@@ -69,7 +69,9 @@ def commissioning_page(_: pytest.MonkeyPatch) -> str:
 
 @pytest.mark.skipif(AXE is None, reason="axe-core-python is not installed")
 @pytest.mark.parametrize("made", [report, fleet_page, commissioning_page])
-def test_no_page_has_a_serious_violation_wide_or_narrow_light_or_dark(made, tmp_path, monkeypatch):
+def test_pages_have_no_serious_accessibility_violation_at_any_width_or_theme(
+    made, tmp_path, monkeypatch
+):
     file = tmp_path / "page.html"
     file.write_text(made(monkeypatch))
     with Browser(tmp_path / "profile") as browser:
@@ -100,7 +102,7 @@ def test_charts_work_with_mouse_and_keyboard(tmp_path, monkeypatch):
             if reached[-1] == "live":
                 break
         assert "live" in reached
-        # Who does not see where the focus is, cannot use it.
+        # Keyboard users need a visible focus outline.
         assert browser.value("getComputedStyle(document.activeElement).outlineStyle") != "none"
         whole = browser.value("document.activeElement.dataset.shown")
         press(browser, "+", "+")

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Samples that are stamped alike count as one, and the user hears of it."""
+"""Samples with equal stamps are repaired or merged, with a finding."""
 
 from dataclasses import replace
 
@@ -13,14 +13,14 @@ from smp_motor_ident.record import Record
 
 
 def bunched(size: int) -> Record:
-    """A record whose stamps are equal (but for 1 ns) in bunches, as a coarse clock makes them."""
+    """Return a record with stamps equal to 1 ns in bunches, as from a coarse clock."""
     made = motors.record("rear_left", current=False, seconds=8.0)
     row = np.arange(len(made))
     last = np.minimum((row // size + 1) * size - 1, len(made) - 1)
     return replace(made, time=made.time[last] + 1e-9 * (row % size))
 
 
-def test_equal_stamps_on_a_beat_are_repaired_with_a_finding():
+def test_equal_stamps_of_a_periodic_sensor_are_repaired_with_a_finding():
     plain = estimate(motors.record("rear_left", current=False, seconds=8.0))
     found = estimate(bunched(4))
     assert "arrival_beat" in [f.code for f in found.findings]
@@ -29,13 +29,13 @@ def test_equal_stamps_on_a_beat_are_repaired_with_a_finding():
     assert found.value("time_constant") == pytest.approx(plain.value("time_constant"), rel=0.02)
 
 
-def test_equal_stamps_without_a_beat_are_merged_with_a_finding():
+def test_merging_bunches_keeps_one_sample_per_stamp_with_a_warning():
     merged = merge_bunches(bunched(4))
     assert len(merged) == pytest.approx(len(bunched(4)) / 4, abs=1)
     assert [f.severity for f in merged.findings if f.code == "stamps_equal"] == ["warning"]
 
 
-def test_segments_begin_where_they_began():
+def test_merging_bunches_keeps_segment_start_times():
     made = bunched(4)
     made = replace(made, starts=(0, 401, 1203))
     merged = merge_bunches(made)
@@ -45,6 +45,6 @@ def test_segments_begin_where_they_began():
     )
 
 
-def test_stamps_that_tell_samples_apart_are_left_alone():
+def test_merging_bunches_leaves_distinct_stamps_unchanged():
     made = motors.record("rear_left", current=False, seconds=5.0)
     assert merge_bunches(made) is made

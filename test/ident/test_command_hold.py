@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How a logged command ran is asked of the data: a row's value before it, after it, or between."""
+"""The hold of a logged command is identified: before its row, after it, or interpolated."""
 
 import numpy as np
 import pytest
@@ -32,8 +32,8 @@ def assert_covered(record: Record, truth: dict[str, float]) -> None:
 
 
 @pytest.mark.parametrize("current", [False, True])
-def test_a_motor_that_answers_before_its_command_was_read_an_interval_late(current):
-    """A smooth command has no edges that would show that it acts before its rows."""
+def test_delay_is_estimated_when_commands_are_logged_one_row_late(current):
+    """A smooth command has no edges that reveal the one-row shift."""
     rng = np.random.default_rng(6)
     t = np.arange(3000) / 100
     tones = rng.uniform(0.1, 2.0, 8)
@@ -49,7 +49,7 @@ def test_a_motor_that_answers_before_its_command_was_read_an_interval_late(curre
 
 
 @pytest.mark.parametrize("kind", ["square", "fourier", "sine"])
-def test_a_command_logged_early_does_not_slow_the_motor(kind):
+def test_delay_is_estimated_when_commands_are_logged_one_row_early(kind):
     t = np.arange(3000) / 200
     v = excitation(t, kind, 9.0)
     ran = np.concatenate([v[:1], v[:-1]])  # over the interval that ends at each row
@@ -61,7 +61,7 @@ def test_a_command_logged_early_does_not_slow_the_motor(kind):
     assert abs(delay.value - 1 / 200) < 4 * delay.std < 2e-3
 
 
-def test_a_winding_of_one_interval_is_not_surely_a_later_command():
+def test_time_constant_interval_covers_truth_if_electrical_lag_is_one_sample():
     t = np.arange(8000) / 1000
     v = 9.0 * np.interp((t / 2.0) % 4.0, [0.0, 1.0, 3.0, 4.0], [0.0, 1.0, -1.0, 0.0])
     out = simulate(t, v, R, R / 1000, K, J, B, TC, np.zeros(t.size), 100)
@@ -72,7 +72,7 @@ def test_a_winding_of_one_interval_is_not_surely_a_later_command():
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_a_linearly_interpolated_command_does_not_increase_the_inductance(seed):
+def test_first_order_hold_of_the_command_does_not_bias_the_estimate(seed):
     rng = np.random.default_rng(seed)
     t = np.arange(3000) / 100
     tones = (0.3, 0.7, 1.3, 2.9, 5.1)
@@ -86,7 +86,7 @@ def test_a_linearly_interpolated_command_does_not_increase_the_inductance(seed):
 
 
 def late_record(seed, tones, rate, samples, per_turn, late=None):
-    """Return counts of a motor that takes tones up none or some tenths of a sample late."""
+    """Return counts of a motor under tones, delayed by 0 to 0.9 samples."""
     rng = np.random.default_rng(seed)
     drawn = int(rng.integers(0, 10)) if rng.random() < 0.5 else 0
     late = drawn if late is None else late
@@ -97,9 +97,9 @@ def late_record(seed, tones, rate, samples, per_turn, late=None):
 
 
 def late_counts(rng, v, rate, per_turn, late, motor, noise=None):
-    """Return counts of a motor that takes each command up some tenths of a sample late.
+    """Return counts of a motor whose commands act ``late`` tenths of a sample late.
 
-    With its current, where the ``noise`` of that is given [A].
+    The current is included if its ``noise`` [A] is given.
     """
     samples = v.size
     t = np.arange(samples) / rate
@@ -121,8 +121,8 @@ def test_a_fractional_delay_of_a_command_is_estimated(late):
 
 
 @pytest.mark.parametrize("seed", [0, 3, 5])
-def test_half_a_sample_of_delay_of_a_ramp_does_not_increase_the_lag(seed):
-    """Switches in the middle of the intervals look like it, and take its place if they may."""
+def test_half_sample_delay_under_ramps_does_not_bias_the_lags(seed):
+    """Command switches in mid-interval are confounded with such a delay."""
     motor = 13.6, 3.2e-3, 0.014, 7.5e-7, 3.2e-6, 4.4e-4
     rng = np.random.default_rng(seed)
     corners, length = np.cumsum(rng.uniform(0.3, 2.5, 12)), int(rng.integers(4, 13))
@@ -137,8 +137,8 @@ def test_half_a_sample_of_delay_of_a_ramp_does_not_increase_the_lag(seed):
     assert_covered(record, {"dc_gain": k / below, **lags, "static_voltage": r * tc / k})
 
 
-def test_lags_bear_a_part_of_a_sample_that_slow_commands_do_not_show():
-    """Coarse counts of slow tones tell a delay and a second lag apart by a fraction of a sample."""
+def test_lag_interval_covers_subsample_delay_hidden_by_slow_commands():
+    """Coarse counts separate delay and second lag only to a fraction of a sample."""
     known, errors = truth("rear_left", 0.3), []
     for seed in range(20):
         found = estimate(late_record(seed, (0.2, 0.5, 1.1, 2.3), 500, 5000, 28.0)).combinations
@@ -147,7 +147,7 @@ def test_lags_bear_a_part_of_a_sample_that_slow_commands_do_not_show():
     assert np.abs(errors).max() < 4
 
 
-def test_initial_states_of_held_out_data_are_found_from_wherever_they_begin():
+def test_initial_state_of_held_out_data_is_estimated():
     rng = np.random.default_rng(5)
     t = np.arange(3000) / 1000
     v = np.repeat(rng.uniform(2.0, 9.0, 100), 30)
@@ -159,8 +159,8 @@ def test_initial_states_of_held_out_data_are_found_from_wherever_they_begin():
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_a_delay_may_be_in_part_the_windings_lag(seed):
-    """Half a millisecond of L/R and 3 ms of delay: rows of 10 ms show only their sum."""
+def test_time_constant_interval_covers_delay_confounded_with_electrical_lag(seed):
+    """At 10 ms sampling only the sum of L/R (0.5 ms) and delay (3 ms) is identifiable."""
     rng = np.random.default_rng(seed)
     r, el, k, b, lag = 1.0, 5e-4, 0.5, 0.0125, 0.206
     below = k * k + r * b
@@ -177,8 +177,8 @@ def test_a_delay_may_be_in_part_the_windings_lag(seed):
 
 
 @pytest.mark.parametrize("late", [42, 21])
-def test_a_delay_just_beyond_a_whole_sample_is_not_given_to_the_winding(late):
-    """The likelihood has a kink at each whole sample, and a minimum of its own on either side."""
+def test_delay_just_beyond_a_whole_sample_does_not_bias_the_inductance(late):
+    """The likelihood has a kink at each whole sample and a local optimum on either side."""
     rng = np.random.default_rng(0)
     t = np.arange(6000) / 200
     v = 6.0 * np.sin(2 * np.pi * (0.07 * t + 1.4 / t[-1] * t**2))

@@ -37,7 +37,7 @@ def change(wheel: str, name: str, setpoint: float) -> Change:
 
 @pytest.fixture
 def passed(tmp_path: Path) -> Path:
-    """A folder with a commissioning that passed, of four wheels that drove both ways."""
+    """Return a folder with a passed commissioning of four wheels, driven both ways."""
     estimates = {wheel: estimate(wheel) for wheel in WHEELS}
     shares = (Share("current_scale", 0.03, 0.39), Share("smoothed_current", 0.0043, 0.06),
               Share("low_passed_current", 0.0022, 0.03))  # fmt: skip
@@ -71,7 +71,7 @@ def shown(browser: Browser, where: str) -> list[str]:
     return found
 
 
-def test_page_opens_with_motors_and_gains_then_yaml_then_the_drive(passed, tmp_path):
+def test_page_shows_gains_then_yaml_then_verification_drive(passed, tmp_path):
     with Browser(tmp_path / "profile") as browser:
         browser.open(passed / "report.html", 1280)
         assert shown(browser, "main h2") == [
@@ -93,7 +93,7 @@ def test_page_opens_with_motors_and_gains_then_yaml_then_the_drive(passed, tmp_p
         # The button copies the parameter file.
         (copied,) = shown(browser, "#gains pre")
         assert yaml.safe_load(copied) == yaml.safe_load((passed / "gains.yaml").read_text())
-        # Predicted and measured lie in one chart a wheel, each with both ways.
+        # One chart per wheel shows the predicted and measured speed of both directions.
         charts: list[dict[str, Any]] = browser.value(
             "JSON.parse(document.getElementById('charts').textContent)"
         )
@@ -102,7 +102,7 @@ def test_page_opens_with_motors_and_gains_then_yaml_then_the_drive(passed, tmp_p
 
 
 @pytest.mark.parametrize("width", [1280, 1000, 720, 390])
-def test_no_table_is_cut_and_the_page_does_not_scroll_sideways(passed, tmp_path, width):
+def test_tables_fit_the_page_width_without_horizontal_scrolling(passed, tmp_path, width):
     with Browser(tmp_path / "profile") as browser:
         browser.open(passed / "report.html", width)
         assert browser.value("document.documentElement.scrollWidth") <= width
@@ -115,7 +115,7 @@ def test_no_table_is_cut_and_the_page_does_not_scroll_sideways(passed, tmp_path,
         assert ends and all(cell <= panel and over <= 0 for cell, panel, over in ends)
 
 
-def test_gains_that_have_not_driven_are_not_called_passed(passed, tmp_path):
+def test_unverified_gains_are_not_reported_as_passed(passed, tmp_path):
     made = CommissioningLog(passed)
     made.store_changes([])
     made.store_verdict(False, "stopped: a wheel settles late")

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The plan of a commissioning, before anything moves."""
+"""Plan, interruption and resumption of a commissioning."""
 
 import json
 import shutil
@@ -22,7 +22,7 @@ from smp_motor_ident.report.document import identification_document
 from smp_motor_ident.result import Estimate, to_json
 
 
-def test_a_dry_run_prints_and_draws_the_plan_and_touches_nothing(tmp_path, capsys):
+def test_dry_run_prints_the_plan_and_creates_no_files(tmp_path, capsys):
     folder = tmp_path / "robot"
     arguments = ["--output", str(folder), "--amplitude", "8", "--duration", "10", "--dry-run"]
     assert main(arguments) == 0
@@ -45,7 +45,7 @@ GIVEN = "/**/left/wheel_pid:\n  ros__parameters:\n    p: 1.0\n"
 
 
 class Steps:
-    """The steps of a commissioning, each noted; the one that is called ``cut`` is interrupted."""
+    """Fake commissioning steps that log their calls; the step named ``cut`` is interrupted."""
 
     def __init__(self, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         self.folder, self.done = folder, list[str]()
@@ -99,7 +99,7 @@ class Steps:
         return checking.CheckResult(self.found, {"left": FIGURES}, 4.0, 1.6)
 
     def record(self, robot: object, name: str) -> Path:
-        (self.folder / name).mkdir()  # as record does, which refuses a folder that is there
+        (self.folder / name).mkdir()  # as record does, which refuses an existing folder
         return self.folder / name
 
     def tune(self, *_: object) -> None:
@@ -117,7 +117,7 @@ def robot(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Steps:
     return Steps(tmp_path / "robot", monkeypatch)
 
 
-def test_an_interrupted_commissioning_sends_the_same_commands(robot):
+def test_resumed_commissioning_sends_the_same_commands_as_an_uninterrupted_one(robot):
     robot.more = plan.Recording("excitation", "further", steps.Excitation("fourier", 9.0, 5.0))
     assert main([*robot.given, "--amplitude", "5", "--duration", "2"]) == 0
     moved = ["check", *["excite"] * 4, "identify", "excite", "identify"]
@@ -139,11 +139,11 @@ def test_interrupted_motion_is_repeated_and_completed_motion_is_not(tmp_path, ro
     other = tmp_path / "other"
     other.mkdir()
     (other / "diary").touch()
-    assert main(["--output", str(other), "--yes", "--resume"]) == 2  # nothing of ours
+    assert main(["--output", str(other), "--yes", "--resume"]) == 2  # not a commissioning
     assert (other / "diary").exists()
     robot.cut = "excite"
     assert main(robot.given) == 130
-    assert main(robot.given) == 2  # a folder that is there is not overwritten unasked
+    assert main(robot.given) == 2  # an existing folder is not overwritten
     robot.cut = "identify"
     assert main([*robot.given, "--resume"]) == 130
     robot.cut = ""
@@ -155,21 +155,21 @@ def test_interrupted_motion_is_repeated_and_completed_motion_is_not(tmp_path, ro
     assert document["passed"] and document["checks"]["left"]["gain"] == 25.0
 
 
-def test_a_drive_that_failed_is_driven_again_and_nothing_else_is_done_again(robot):
+def test_resume_repeats_only_failed_or_missing_steps(robot):
     robot.cut = "verify"
     assert main(robot.given) == 130
     assert robot.done[-4:] == ["identify", "validate", "tune", "verify"]
     robot.done, robot.cut = [], ""
     assert main([*robot.given, "--resume"]) == 0
     assert robot.done == ["verify"]
-    # A recording that is missing is made again, and what follows from it.
+    # A missing recording is repeated, with all steps that depend on it.
     robot.done = []
     shutil.rmtree(robot.folder / "excitation" / "sine")
     assert main([*robot.given, "--resume"]) == 0
     assert robot.done == ["excite", "identify", "validate", "tune", "verify"]
 
 
-def test_a_drive_alone_is_asked_for_too(robot, capsys):
+def test_resumed_verification_drive_requires_confirmation(robot, capsys):
     robot.cut = "verify"
     assert main(robot.given) == 130
     robot.done, robot.cut = [], ""
@@ -184,11 +184,11 @@ def test_apply_without_a_controller_is_refused_before_motion(robot, capsys, monk
     assert main(robot.given) == 0
     told = capsys.readouterr().out
     assert "no wheel_pid runs for left: one is started" in told
-    # It is said before the first wheel moves.
+    # The message precedes the first motion.
     assert told.index("one is started") < told.index("exciting: sine")
 
 
-def test_an_unreliable_motor_is_designed_on_only_where_that_is_accepted(robot, monkeypatch):
+def test_design_on_unreliable_identification_requires_acceptance(robot, monkeypatch):
     grave = Finding("lag", "unreliable", "the gain may be off", {}, "record longer")
     robot.estimate = replace(robot.estimate, findings=(grave,))
     tuned = list[str]()
@@ -203,7 +203,7 @@ def test_an_unreliable_motor_is_designed_on_only_where_that_is_accepted(robot, m
     assert "Passed with accepted findings." in (robot.folder / "report.html").read_text()
 
 
-def test_a_wrong_wire_stops_before_the_excitation_unless_it_is_accepted(robot, capsys):
+def test_reversed_wiring_stops_commissioning_before_excitation_unless_accepted(robot, capsys):
     robot.found = (STOP,)
     assert main(robot.given) == 1
     said = capsys.readouterr().err
@@ -211,13 +211,13 @@ def test_a_wrong_wire_stops_before_the_excitation_unless_it_is_accepted(robot, c
     assert robot.done == ["check"]
     page = (robot.folder / "report.html").read_text()
     assert "Not passed." in page and STOP.message in page and STOP.advice in page
-    # The wire is mended, or it is so on purpose: the same folder goes on.
+    # The user repairs or accepts the wiring and resumes in the same folder.
     assert main([*robot.given, "--resume", "--accept", "reversed"]) == 0
     page = (robot.folder / "report.html").read_text()
     assert "Passed with accepted findings." in page
 
 
-def test_a_hot_winding_ends_it_before_the_next_signal_and_goes_on_when_it_is_cool(robot):
+def test_hot_winding_stops_commissioning_until_it_has_cooled(robot):
     robot.heat = [Finding("winding_hot", "refused", "left: 60 K hotter", {"wheel": "left"}, "wait")]
     assert main(robot.given) != 0
     assert robot.done == ["check", "excite"]
@@ -227,7 +227,7 @@ def test_a_hot_winding_ends_it_before_the_next_signal_and_goes_on_when_it_is_coo
     assert robot.done.count("excite") == 4
 
 
-def test_the_reason_of_an_abnormal_end_is_on_the_page(robot, monkeypatch):
+def test_failure_reason_is_stored_in_the_verdict(robot, monkeypatch):
     def refuse(*_: object) -> None:
         raise ProcessError("left/wheel_pid refused the parameters")
 
@@ -237,9 +237,9 @@ def test_the_reason_of_an_abnormal_end_is_on_the_page(robot, monkeypatch):
     assert document["passed"] is False and "refused the parameters" in document["verdict"]
 
 
-def test_a_wheel_that_turns_faster_than_its_checks_or_its_limit_ends_the_excitation(robot):
+def test_excitation_speed_is_bounded_by_the_checked_speed_or_the_given_limit(robot):
     assert main(robot.given) == 0
-    # The checks show 1.6 rad/s; half as much again is no supply's and no friction's doing.
+    # The checks show 1.6 rad/s; neither supply nor friction can raise it by half.
     assert robot.bounds["max_speed"] == pytest.approx(1.5 * 1.6)
     assert robot.bounds["max_current"] == 0.0
     shutil.rmtree(robot.folder)
@@ -249,7 +249,7 @@ def test_a_wheel_that_turns_faster_than_its_checks_or_its_limit_ends_the_excitat
     assert asked == [3.0, 2.0]
 
 
-def test_the_remaining_time_follows_the_duration_of_similar_parts():
+def test_remaining_time_is_estimated_from_completed_steps_of_the_same_kind():
     now = [0.0]
     robots = [plan.Recording("excitation", name, steps.Excitation(name, 10.0, 6.0))
               for name in ("sine", "square")]  # fmt: skip
@@ -264,13 +264,13 @@ def test_the_remaining_time_follows_the_duration_of_similar_parts():
     now[0] = 25.0
     assert timed.left() == 20.0  # overdue steps count as almost finished
     timed.begin("b")
-    assert timed.left() == 25.0 + 10.0  # b is late as a was, c is of another kind
+    assert timed.left() == 25.0 + 10.0  # b takes as long as a did; c is of another kind
     now[0] = 30.0
     assert timed.left() == 20.0 + 10.0
     assert plan.format_duration(30.4) == "30 s" and plan.format_duration(123.0) == "2 min 5 s"
 
 
-def test_a_motor_that_is_not_known_well_enough_is_recorded_once_more():
+def test_imprecise_estimate_requests_one_more_recording():
     known = make_estimate()  # to a percent, and the gain better
     assert plan.plan_extra_recording({"left": known}, 6.0) is None
     vague = replace(known.combinations["time_constant"], std=0.002)  # 5 %

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A commissioning that is cut off and gone on with ends with the numbers of one that is not."""
+"""A resumed commissioning gives the results of an uninterrupted one."""
 
 import json
 import math
@@ -25,7 +25,7 @@ FIGURES = Figures(100.0, 0.001, 0, 0.0, 0.5, 1.0, 1.0, 1.0, 25.0, 0.4, 0.05, 5.0
 
 
 class Robot:
-    """Its motor is simulated when ``excite`` moves it; a run completes ``fuel`` parts."""
+    """A robot with a simulated motor; each run is interrupted after ``fuel`` parts."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         self.fuel, self.left, self.draft = 100, 0, Path()
@@ -72,7 +72,7 @@ def write(folder: Path, did: Record) -> None:
 
 
 def numbers(folder: Path) -> dict[str, Any]:
-    """What came out, without dates and paths."""
+    """Return the results without dates and paths."""
     gains = json.loads((folder / "gains.json").read_text())
     return {
         "identification": (folder / "identification" / "identification.json").read_text(),
@@ -82,7 +82,7 @@ def numbers(folder: Path) -> dict[str, Any]:
     }
 
 
-def test_it_ends_with_the_same_numbers_to_the_bit(tmp_path, monkeypatch):
+def test_resumed_commissioning_gives_bit_identical_results(tmp_path, monkeypatch):
     robot, codes = Robot(monkeypatch), list[int]()
     asked = ["--yes", "--amplitude", "6", "--duration", "2"]
     assert main(["--output", str(tmp_path / "whole"), *asked]) == 0

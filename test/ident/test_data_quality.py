@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Bad data are named, and never give an estimate."""
+"""Bad data are refused or reported with a reason, never estimated silently."""
 
 from dataclasses import replace
 
@@ -49,7 +49,7 @@ BAD = {
 
 
 @pytest.mark.parametrize("name", BAD)
-def test_bad_data_are_named(name):
+def test_bad_data_are_refused_with_a_reason(name):
     recording, error, words = BAD[name]
     with pytest.raises(error, match=words) as caught:
         estimate(recording)
@@ -57,13 +57,13 @@ def test_bad_data_are_named(name):
     assert "\n" not in str(caught.value)
 
 
-def test_a_speed_that_has_nothing_to_do_with_the_voltage_is_refused():
+def test_speed_uncorrelated_with_voltage_is_refused():
     noise = 50 * np.random.default_rng(0).standard_normal(N)
     with pytest.raises((SignalError, InsufficientExcitationError)):
         estimate(replace(GOOD, count=None, velocity=noise).slice(0, N // 2))
 
 
-def test_a_current_clipped_by_a_two_level_command_is_saturated():
+def test_clipped_current_under_a_two_level_command_is_refused_as_saturated():
     random = np.repeat(np.sign(np.random.default_rng(2).standard_normal(N // 40)), 40) * 8.0
     good = motors.record("rear_left", voltage=random, seconds=4.0)
     with pytest.raises(SignalError, match="saturated sensor, current"):
@@ -71,34 +71,34 @@ def test_a_current_clipped_by_a_two_level_command_is_saturated():
 
 
 @pytest.mark.parametrize("late", [0, 2])
-def test_a_speed_that_settles_on_its_resolution_is_not_saturated(late):
-    """To a tenth of a rad/s it rests within 40 samples of each step, and late until the next."""
+def test_steady_speed_at_its_quantisation_is_not_refused_as_saturated(late):
+    """The rounded speed settles to one level within 40 samples of each step."""
     level = np.repeat([3.0, 8.0, 5.0, 8.0, 2.0, 8.0, 0.0, 6.0], 40)
     speed = lfilter([0.5], [1.0, -0.5], np.roll(level, late) * 25.0)
     screen_records([Record("motor", np.arange(320) / 50.0, level, velocity=np.round(speed, 1))])
 
 
-def test_a_peak_that_is_held_for_some_rows_is_not_saturated():
-    """A board that reports its speed late says a peak of noise six times."""
+def test_noise_peak_held_for_six_rows_is_not_refused_as_saturated():
+    """A board with a slow speed update repeats a noise peak six times."""
     level = np.repeat([3.0, 8.0, 5.0, 2.0, 6.0], 60) + np.linspace(0.0, 1.0, 300)
     speed = 25.0 * level + np.random.default_rng(4).normal(0.0, 2.0, 300)
     speed[100:106] = speed.max() + 20.0
     screen_records([Record("motor", np.arange(300) / 100.0, level, velocity=speed)])
 
 
-def test_one_level_of_voltage_is_not_saturation():
+def test_steady_speed_under_one_voltage_level_is_not_refused_as_saturated():
     speed = np.round(8.0 * 25.0 * (1 - np.exp(-np.arange(300) / 30)), 1)
     level = np.r_[np.zeros(20), np.full(280, 8.0)]
     screen_records([Record("motor", np.arange(300) / 100.0, level, velocity=speed)])
 
 
-def test_a_voltmeter_that_scatters_around_a_level_is_a_constant_input():
+def test_constant_voltage_with_measurement_noise_is_refused_as_constant():
     noise = 0.01 * np.random.default_rng(3).standard_normal(N)
     with pytest.raises(InsufficientExcitationError, match="constant at 6"):
         estimate(motors.record("rear_left", seconds=4.0, voltage=6.0 + noise).slice(N // 2, N))
 
 
-def test_a_current_of_swapped_leads_is_left_out_and_reported():
+def test_current_with_swapped_sign_is_excluded_and_reported():
     result = estimate(replace(GOOD, current=-GOOD.current))
     (said,) = [f for f in result.findings if f.code == "current_left_out"]
     assert said.severity == "warning" and "swapped sign, current" in said.message
@@ -111,7 +111,7 @@ def test_a_small_offset_of_the_current_is_removed_and_reported():
     assert result.value("resistance") == pytest.approx(3.2843, rel=2e-3)  # 5 of its std
 
 
-def test_a_speed_that_a_filter_makes_late_and_small_has_the_gear_ratio_of_its_angle():
+def test_filtered_speed_is_not_refused_as_wrong_gear_ratio():
     """The lag is 30 ms, the time constant 50 ms: about 0.8 of the speed remains."""
     slow = np.zeros(N)
     for n in range(1, N):
@@ -120,8 +120,8 @@ def test_a_speed_that_a_filter_makes_late_and_small_has_the_gear_ratio_of_its_an
 
 
 @pytest.mark.parametrize("offset", [0.0, 1.2])
-def test_a_noisy_speed_does_not_bias_the_offset_of_the_current(offset):
-    """Its noise takes a share of its coefficient, which driven one way looks like an offset."""
+def test_speed_noise_does_not_bias_the_current_offset(offset):
+    """Noise attenuates the speed coefficient, which in one direction looks like an offset."""
     rng = np.random.default_rng(1)
     volts = np.repeat(rng.uniform(2.0, 10.0, 400), 20)
     true = motors.record("rear_left", voltage=volts, seconds=20.0)
@@ -131,14 +131,14 @@ def test_a_noisy_speed_does_not_bias_the_offset_of_the_current(offset):
     assert any("current has an offset of 1.1" in f.message for f in said) == (offset > 0)
 
 
-def test_gaps_of_nan_are_left_out_and_reported():
+def test_nan_gaps_in_the_current_are_excluded_and_reported():
     amps = np.where(np.arange(N) % 300 < 60, np.nan, GOOD.current)
     result = estimate(replace(GOOD, current=amps))
     assert any(f.code == "samples_lost" for f in result.findings)
     assert result.value("resistance") == pytest.approx(3.2843, rel=2e-3)
 
 
-def test_what_next_stays_within_the_recorded_range():
+def test_proposed_excitation_stays_within_the_recorded_voltage():
     poor = motors.record("rear_left", current=False, amplitude=5.0)
     hardware = replace(poor.hardware, supply_voltage=None)
     proposal = what_next(estimate(replace(poor, hardware=hardware)))
@@ -146,7 +146,7 @@ def test_what_next_stays_within_the_recorded_range():
 
 
 @pytest.mark.parametrize("sign", [1, -1])
-def test_a_motor_below_its_friction_is_at_rest_despite_a_sensor_offset(sign):
+def test_motor_below_breakaway_is_refused_as_standing_despite_sensor_offset(sign):
     volts = np.where(np.arange(N) < N // 4, 0.002, 1.1 * sign)
     offset = replace(GOOD, count=None, current=None, voltage=volts, velocity=np.full(N, 0.13))
     with pytest.raises(SignalError, match=r"standing motor.*no excitation above friction"):
@@ -162,7 +162,7 @@ def test_a_motor_below_its_friction_is_at_rest_despite_a_sensor_offset(sign):
         (1.7, 1.0, "wrong gear ratio"),
     ],
 )
-def test_a_speed_that_is_an_angles_slope_in_another_unit_names_both(speed, angle, words):
+def test_unit_mismatch_between_speed_and_angle_is_named(speed, angle, words):
     turned = np.cumsum(GOOD.velocity) * np.median(np.diff(GOOD.time))
     mixed = replace(GOOD, count=None, velocity=speed * GOOD.velocity, position=angle * turned)
     with pytest.raises(SignalError, match=words):
@@ -170,7 +170,7 @@ def test_a_speed_that_is_an_angles_slope_in_another_unit_names_both(speed, angle
 
 
 def _coarse(record: Record, counts: float, samples: int) -> Record:
-    """Return a record with the speed that a firmware makes of counts over some samples."""
+    """Return a record with speed from a difference of counts over some samples."""
     turned = np.cumsum(record.velocity) * record.sample_time
     count = np.floor(turned / (2 * np.pi) * counts)
     moved = count - np.concatenate([np.full(samples, count[0]), count[:-samples]])
@@ -178,16 +178,16 @@ def _coarse(record: Record, counts: float, samples: int) -> Record:
     return replace(record, velocity=speed, count=None, position=None)
 
 
-def test_a_speed_of_few_counts_is_explained_as_closely_as_counts_let_it():
+def test_low_fit_due_to_coarse_counts_is_not_unreliable():
     fine = motors.record("rear_left", current=False, seconds=20.0, kinds=("fourier", "square"))
     coarse = _coarse(replace(fine, count=None), 2.0, 4)
     found = estimate(coarse)  # a count more or less is 157 rad/s of at most 300
-    assert found.fit_percent.estimation < 70  # below which a speed is said to be ill explained
+    assert found.fit_percent.estimation < 70  # below the limit for an unexplained speed
     assert not found.unreliable
     motors.check(found, motors.truth("rear_left", 0.3), ["dc_gain"])
 
 
-def test_a_speed_of_few_counts_of_another_motor_is_refused():
+def test_coarse_speed_unrelated_to_the_voltage_is_refused_or_unreliable():
     fine = motors.record("rear_left", current=False, seconds=8.0, kinds=("fourier", "square"))
     coarse = _coarse(replace(fine, count=None), 2.0, 4)
     rng = np.random.default_rng(4)
@@ -199,7 +199,7 @@ def test_a_speed_of_few_counts_of_another_motor_is_refused():
     assert found.unreliable
 
 
-def test_a_record_in_another_unit_of_time_is_named_among_others():
+def test_record_with_time_in_milliseconds_among_others_is_refused_by_name():
     milliseconds = replace(GOOD, time=1000.0 * GOOD.time, source="third.csv")
     for others in ([GOOD], [GOOD, GOOD]):
         with pytest.raises(SignalError, match=r"third\.csv: a sample every 5 s, 1000 times.*:ms"):
@@ -209,7 +209,7 @@ def test_a_record_in_another_unit_of_time_is_named_among_others():
     )  # 2 Hz and 200 Hz are plausible
 
 
-def test_a_record_at_rest_does_not_decide_the_sign_of_others():
-    """Its speed is an offset of the sensor, which runs against a voltage of the other sign."""
+def test_sign_check_ignores_records_at_rest():
+    """At rest the speed is a sensor offset, which may oppose the voltage."""
     still = replace(GOOD, voltage=np.full(N, 0.4), count=None, velocity=np.full(N, -1e-4))
     screen_records([replace(GOOD, count=None), still])

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A speed that is a difference of coarse counts is summed up to them again."""
+"""Coarse counts are recovered from a speed that is their difference."""
 
 from dataclasses import replace
 
@@ -19,7 +19,7 @@ GAIN, LAG, STEP, TURN = 40.0, 0.03, 0.001, 2 * np.pi / 48
 
 
 def looped(samples: int = 8000, over: int = 1) -> Record:
-    """A speed loop that feeds differences of counts back, over one sample or several."""
+    """Return a closed-loop record with speed from counts over one or several samples."""
     rng = np.random.default_rng(2)
     wanted = np.repeat(rng.uniform(-130.0, 130.0, samples // 200), 200)
     keep = np.exp(-STEP / LAG)
@@ -39,7 +39,7 @@ def looped(samples: int = 8000, over: int = 1) -> Record:
     return Record("motor", t, np.array(voltage), velocity=np.array(shown))
 
 
-def test_a_speed_of_differenced_counts_is_estimated_without_bias_in_a_loop():
+def test_closed_loop_estimate_from_differenced_counts_is_unbiased():
     record = looped()
     (summed,) = recover_counts([record])
     moved = np.diff(summed.position) / TURN
@@ -51,7 +51,7 @@ def test_a_speed_of_differenced_counts_is_estimated_without_bias_in_a_loop():
 
 
 def test_counts_are_detected_in_the_speed_of_an_unmodelled_motor():
-    """A counter rounds whatever the motor does: what turns on when its command ends, too."""
+    """Quantisation is detected even if a load swings on after the command."""
     t = STEP * np.arange(3000)
     speed = np.where(t < 1.5, 1 - np.exp(-t / 0.05), np.exp(-(t - 1.5)) * np.cos(3 * t))
     count = np.floor(np.cumsum(60.0 * speed) * STEP / TURN)
@@ -60,13 +60,13 @@ def test_counts_are_detected_in_the_speed_of_an_unmodelled_motor():
     np.testing.assert_allclose(summed.position / TURN, count, atol=1e-6)
 
 
-def test_a_speed_over_several_samples_is_not_a_difference_of_neighbouring_counts():
+def test_counts_are_not_recovered_from_speed_differenced_over_several_samples():
     record = looped(over=4)
     assert recover_counts([record])[0] is record and read_count_rounding(record) == 0.0
-    assert recover_counts([looped(), record])[1] is record  # and none of the others is
+    assert recover_counts([looped(), record])[1] is record  # also next to a recoverable record
 
 
-def test_speeds_with_lost_samples_or_values_are_not_summed():
+def test_counts_are_not_recovered_from_speed_with_lost_samples():
     record = looped()
     lost = np.delete(np.arange(len(record)), 500)
     gap = Record("motor", record.time[lost], record.voltage[lost], velocity=record.velocity[lost])
@@ -78,11 +78,11 @@ def test_speeds_with_lost_samples_or_values_are_not_summed():
 
 
 PERIOD = 0.0115
-"""Of a loop of 10 ms that is late by some, in the firmware's words [s]."""
+"""Nominal loop period [s] by which the firmware divides; the real loop is jittered."""
 
 
 def late_loop(per_turn: float | None, nominal: bool) -> Record:
-    """A speed from counts, over a nominal period or over the intervals that they took."""
+    """Return speed from counts over the nominal period or over the true intervals."""
     rng = np.random.default_rng(7)
     interval = 0.01 + rng.exponential(0.001, 1500) + (rng.random(1500) < 0.01) * 0.03
     volts = np.repeat(rng.uniform(-12.0, 12.0, 50), 30)
@@ -99,7 +99,7 @@ def late_loop(per_turn: float | None, nominal: bool) -> Record:
     return Record("motor", time, volts, velocity=shown, hardware=hardware)
 
 
-def test_counts_over_a_nominal_period_are_a_speed_over_the_real_intervals():
+def test_speed_over_the_nominal_period_is_corrected_to_true_intervals():
     put_right = correct_nominal_period(late_loop(48.0, nominal=True))
     real = late_loop(48.0, nominal=False)
     np.testing.assert_allclose(put_right.velocity[1:], real.velocity[1:], rtol=1e-9)
@@ -107,13 +107,13 @@ def test_counts_over_a_nominal_period_are_a_speed_over_the_real_intervals():
     check(estimate(late_loop(48.0, nominal=True)), {"dc_gain": GAIN}, most=0.005)
 
 
-def test_a_nominal_period_that_is_not_known_leaves_the_gain_open():
+def test_unknown_nominal_period_makes_the_estimate_unreliable():
     found = estimate(late_loop(None, nominal=True))
     (said,) = [f for f in found.findings if f.code == "nominal_period"]
     assert said.severity == "unreliable" and "counts_per_revolution" in said.advice
 
 
-def test_late_stamps_of_a_regular_sensor_are_not_a_nominal_period():
+def test_stamp_jitter_of_a_periodic_sensor_is_not_corrected_as_nominal_period():
     record = late_loop(48.0, nominal=False)
     regular = PERIOD * np.arange(len(record))
     even = replace(record, time=regular, velocity=GAIN * record.voltage)

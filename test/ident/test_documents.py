@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Documents of results: they read back, spoilt ones are named, files appear all or none."""
+"""Result documents: round trip, refusal of damaged files, atomic writing."""
 
 import json
 import os
@@ -29,7 +29,7 @@ def test_document_reads_back_as_the_same_estimates(tmp_path):
     assert identification_document(again) == identification_document(wheels)
 
 
-def test_motors_file_has_parameters_where_known_and_combinations_where_not():
+def test_motors_file_states_combinations_where_parameters_are_unknown():
     wheels = {"front_left": estimate(), "rear_left": estimate("rear_left", current=False)}
     text = motors_yaml(wheels, ["from a bag"])
     motors = yaml.safe_load(text)["/**/motor_plant"]["ros__parameters"]["motors"]
@@ -49,7 +49,7 @@ def test_motors_file_has_parameters_where_known_and_combinations_where_not():
         ("[]", "schema"), ('{"schema": 1, "motors": {"a": {}}}', "damaged"),
     ],
 )  # fmt: skip
-def test_a_damaged_document_is_named_with_its_reason(tmp_path, text, reason):
+def test_damaged_document_is_refused_with_file_and_reason(tmp_path, text, reason):
     path = tmp_path / "identification.json"
     path.write_text(text)
     with pytest.raises(BagError, match=reason) as error:
@@ -59,7 +59,7 @@ def test_a_damaged_document_is_named_with_its_reason(tmp_path, text, reason):
 
 
 @pytest.mark.parametrize("junk", [None, True, -1, 1e308, 10**400, "x", [], {}, [[]], {"a": {}}])
-def test_any_document_is_read_or_refused_in_one_line(tmp_path, junk):
+def test_document_with_any_value_replaced_is_read_or_refused_in_one_line(tmp_path, junk):
     whole = json.dumps(identification_document({"w": estimate()}))
 
     def places(node: object, way: tuple[str | int, ...] = ()) -> Iterator[tuple[str | int, ...]]:
@@ -86,14 +86,14 @@ def test_any_document_is_read_or_refused_in_one_line(tmp_path, junk):
 
 
 @pytest.mark.parametrize("name", ['a*/\nsystem("x"); //', "a b", "1a", "", "a/", "ä", "../a"])
-def test_a_wheel_that_has_no_ros_name_is_refused(tmp_path, name):
+def test_wheel_with_invalid_ros_name_is_refused(tmp_path, name):
     path = tmp_path / "identification.json"
     path.write_text(json.dumps(identification_document({name: estimate()})))
     with pytest.raises(BagError, match="has no ROS name"):
         read_identification(path)
 
 
-def test_texts_of_a_document_stay_in_their_lines(tmp_path):
+def test_control_characters_in_document_texts_are_replaced(tmp_path):
     document = identification_document({"w": estimate()})
     document["motors"]["w"]["sources"] = ["bag\n#define K_P 0\x1b[2J"]
     (tmp_path / "identification.json").write_text(json.dumps(document))
@@ -101,7 +101,7 @@ def test_texts_of_a_document_stay_in_their_lines(tmp_path):
 
 
 @pytest.mark.parametrize("name", ["frequency", "shown", "bound"])
-def test_lists_of_unequal_length_are_refused(tmp_path, name):
+def test_model_error_lists_of_unequal_length_are_refused(tmp_path, name):
     error = {"frequency": [1.0, 2.0], "shown": [0.1, 0.1], "bound": [0.2, 0.2]}
     document = identification_document({"w": estimate()})
     document["motors"]["w"]["residuals"]["model_error"] = {**error, name: [1.0]}
@@ -110,7 +110,7 @@ def test_lists_of_unequal_length_are_refused(tmp_path, name):
         read_identification(tmp_path)
 
 
-def test_pipes_and_devices_are_refused_at_once(tmp_path):
+def test_named_pipes_are_refused_without_blocking(tmp_path):
     os.mkfifo(tmp_path / "identification.json")
     with pytest.raises(BagError, match="is not a file"):
         read_identification(tmp_path)
@@ -118,7 +118,7 @@ def test_pipes_and_devices_are_refused_at_once(tmp_path):
         read_parameters(tmp_path / "identification.json")
 
 
-def test_aliases_count_whole_before_a_parameter_file_is_built(tmp_path):
+def test_parameter_file_with_exponential_yaml_aliases_is_refused(tmp_path):
     inner = (",".join([f"*a{k - 1}" if k else "1"] * 10) for k in range(9))
     text = "".join(f"a{k}: &a{k} [{one}]\n" for k, one in enumerate(inner))
     (tmp_path / "a.yaml").write_text(text)
@@ -150,7 +150,7 @@ def test_an_invalid_parameter_file_is_refused_in_one_line(tmp_path, text, reason
     assert "\n" not in str(error.value)
 
 
-def test_files_appear_together_and_nothing_is_overwritten_without_force(tmp_path):
+def test_files_are_written_together_and_overwritten_only_with_force(tmp_path):
     folder = tmp_path / "a" / "b"
     files: dict[Path, str | bytes] = {folder / "x.json": "1", folder / "y.yaml": b"2"}
     write_together(files)
@@ -180,7 +180,7 @@ def test_a_failed_write_restores_the_old_files(tmp_path, monkeypatch):
     assert kept == {"a": "old a", "c": "old c"}
 
 
-def test_a_folder_that_cannot_be_made_is_named(tmp_path):
+def test_output_folder_that_cannot_be_created_is_refused(tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(ParameterError, match="cannot be written"):
         write_together({tmp_path / "file" / "sub" / "x": "1"})
@@ -193,7 +193,7 @@ def test_an_unidentifiable_parameter_is_null_and_listed():
     assert document["identifiable"] is False
 
 
-def test_numbers_that_do_not_exist_are_null_never_nan():
+def test_nan_is_written_as_null():
     unknown = Estimate("w", "m", {}, {"dc_gain": Quantity(1.0, float("nan"))})
     assert unknown.to_document()["combinations"]["dc_gain"]["std"] is None
 

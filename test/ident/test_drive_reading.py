@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Changes of set-point in a recorded drive: found by segment, read as the design states them."""
+"""Set-point changes in a recorded drive: detection, and evaluation against the design."""
 
 import json
 import math
@@ -25,7 +25,7 @@ def table(time: np.ndarray, **columns: np.ndarray) -> Table:
     return Table(None, np.round(1e9 * time).astype(np.int64), columns)
 
 
-def test_a_drive_settles_as_tune_predicts(tmp_path):
+def test_measured_settling_of_a_simulated_drive_matches_the_design(tmp_path):
     motors = find_config(PAPER_MOTORS)
     gains = tmp_path / "gains.yaml"
     assert tune.main([str(motors), "--output", str(gains), "--supply", "12"]) == 0
@@ -48,7 +48,7 @@ def test_a_drive_settles_as_tune_predicts(tmp_path):
     setpoints = np.array([asked[min(int(t / LASTS), len(asked) - 1)] for t in run.time])
     steps = np.full(run.time.size, STEP)
     answers = table(run.time, setpoint=setpoints, output=none, age=steps, dt=steps)
-    # A segment begins when it is sent, 12 ms before the wheel hears of it.
+    # A segment begins when it is sent, 12 ms before the wheel receives it.
     segments = [(name, k * LASTS - 0.012, (k + 1) * LASTS) for k, (name, _) in enumerate(SEGMENTS)]
     moves = driving.find_moves(segments, answers)
     assert [(m.name, m.before, m.setpoint) for m in moves] == [
@@ -58,15 +58,15 @@ def test_a_drive_settles_as_tune_predicts(tmp_path):
         WHEEL, driving.DriveRecording(state, answers), moves, given
     )
     for one in changes:
-        # Another size of change, with counts and a speed read from them: two samples.
+        # Tolerance of two samples: another size of change, and speed from counts.
         assert abs(one.reading.settling - stated["value"]) <= 2 * STEP
         assert abs(one.reading.settling - one.expected.settling) <= STEP
         assert one.reading.overshoot < 1.0
-    # A wheel that lags behind is seen: the same drive, a tenth of a second late.
+    # A lagging wheel is detected: the same drive, 0.1 s late.
     late = driving.DriveRecording(table(run.time + 0.1, **state.columns), answers)
     (behind, *_), _ = driving.evaluate_changes(WHEEL, late, moves, given)
     assert behind.reading.settling - stated["value"] > 0.05
-    # A clock that was set before the drive ended: a line, and no memory for the years between.
+    # A clock step during the drive gives one error line and allocates no samples for the gap.
     early = np.where(run.time < 0.5, 0.0, 1.7e9) + run.time
     torn = driving.DriveRecording(table(early, **state.columns), table(early, **answers.columns))
     wide = [replace(one, begin=one.begin + 1.7e9) for one in moves]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A speed from the time between edges is treated as a mean, held until the next edge."""
+"""Speed from the time between encoder edges is a mean, held until the next edge."""
 
 from dataclasses import replace
 
@@ -61,7 +61,7 @@ def recorded(tick: float, per_turn: float | None) -> Record:
 
 
 @pytest.mark.parametrize("tick, per_turn", [(1e-6, None), (4e-6, 48.0)])
-def test_values_held_by_an_edge_timer_are_not_a_dead_zone(tick, per_turn):
+def test_held_edge_timer_readings_are_not_estimated_as_dead_zone(tick, per_turn):
     record = recorded(tick, per_turn)
     (said,) = [f for f in interpolate_edge_timing(record).findings if f.code == "edge_timer"]
     assert said.evidence["count"] == pytest.approx(COUNT, rel=0.25)  # by how it is held: to a row
@@ -70,7 +70,7 @@ def test_values_held_by_an_edge_timer_are_not_a_dead_zone(tick, per_turn):
     check(found, {"dc_gain": GAIN, "static_voltage": STATIC}, most=0.25)
 
 
-def test_a_rounded_or_held_speed_from_counts_is_not_edge_timed():
+def test_rounded_or_held_speed_is_not_detected_as_edge_timed():
     volts = steps()
     speed, angle = motion(volts)
     every = round(STEP / FINE)
@@ -93,8 +93,8 @@ def test_a_rounded_or_held_speed_from_counts_is_not_edge_timed():
     assert interpolate_edge_timing(counted) is counted
 
 
-def test_the_tail_of_a_filter_is_not_edge_timed():
-    """Written with a few digits, it passes through all sizes, and stays at some for rows."""
+def test_exponential_decay_of_a_filter_is_not_detected_as_edge_timed():
+    """A decay logged with four digits passes all magnitudes and repeats some values."""
     shown = 300.0 * np.exp(-np.arange(2000) / 90.0)
     tail = np.array([float(f"{w:.4g}") for w in shown])
     tail[tail < 2e-6] = np.repeat(tail[tail < 2e-6][::3], 3)[: (tail < 2e-6).sum()]
@@ -103,8 +103,8 @@ def test_the_tail_of_a_filter_is_not_edge_timed():
 
 
 @pytest.mark.parametrize("per_turn", [60, 150, 400])
-def test_friction_is_found_with_an_edge_timer_in_fast_reversals(per_turn):
-    """Where it passes zero, a reading is late by up to a row or two, and nearly none elsewhere."""
+def test_friction_is_estimated_from_edge_timer_speed_under_fast_reversals(per_turn):
+    """Near zero speed a reading is up to two rows late; elsewhere nearly not at all."""
     volts = np.repeat(np.tile([3.0, -3.0], 25), 60)
     speed, angle = motion(volts)
     shown = timed(speed, angle, 1e-6, 2 * np.pi / per_turn)

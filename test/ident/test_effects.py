@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Effects of drivers, sensors and loads are found, and leave the motor's values right."""
+"""Effects of drivers, sensors and loads are found without parameter bias."""
 
 from dataclasses import replace
 
@@ -16,13 +16,13 @@ LEAST = 1.5
 
 
 @pytest.mark.parametrize("current", [False, True])
-def test_a_driver_that_ignores_small_commands_is_named_and_leaves_the_motor_right(current):
+def test_driver_dead_zone_is_found_without_parameter_bias(current):
     level = 0.6 * np.random.default_rng(3).integers(-15, 16, 30)
     command = np.repeat(level, 100)
     made = motors.record(current=current, voltage=np.where(np.abs(command) < LEAST, 0.0, command))
     found = estimate(replace(made, voltage=command))
     assert "hard_dead_zone" in [f.code for f in found.findings]
-    # No command lies in between, so the data tell no more.
+    # No command lies in between, so the threshold is not known better.
     least = found.combinations["least_command"]
     assert 1.2 < least.value < 1.8
     assert 0.05 < least.total_std < 0.6
@@ -33,7 +33,7 @@ def test_a_driver_that_ignores_small_commands_is_named_and_leaves_the_motor_righ
 
 
 @pytest.mark.parametrize("error", [0.0, 0.003, 0.06])
-def test_encoder_error_once_a_turn_is_found_with_its_size(error):
+def test_once_per_turn_encoder_error_is_estimated(error):
     rng = np.random.default_rng(1)
     t = np.arange(4000) / 200
     voltage = np.repeat(rng.uniform(-9.0, 9.0, 100), 40)
@@ -54,7 +54,7 @@ FINER = 20  # steps of the driver's clock to a sample
 
 
 def jittered(latest: float, seed: int) -> Record:
-    """Return random steps that reach the motor up to so many samples late, each by its own time."""
+    """Return random steps, each delayed by a random time of up to ``latest`` samples."""
     rng = np.random.default_rng(seed)
     asked = np.repeat(rng.uniform(-10.0, 10.0, 200), 10)
     fine = np.repeat(asked, FINER)
@@ -69,13 +69,13 @@ def jittered(latest: float, seed: int) -> Record:
     return Record("rear_left", t[rows] - t[rows[0]], asked, velocity=speed)
 
 
-def test_the_scatter_of_commands_is_covered():
+def test_command_jitter_is_covered_by_the_total_uncertainty():
     for found in (estimate(jittered(1.0, seed)) for seed in range(3)):
         names = ("dc_gain", "time_constant", "time_constant_product")
         motors.check(found, motors.truth("rear_left", 0.0), names, sigmas=3.5, total=True)
 
 
-def test_a_delay_that_is_declared_stays_so_under_scatter():
+def test_fixed_delay_is_kept_under_command_jitter():
     found = estimate(jittered(1.0, 0), fixed={"delay": 0.5 / COMMAND_RATE})
     assert found.combinations["delay"].value == 0.5 / COMMAND_RATE
     truth = motors.truth("rear_left", 0.0)
@@ -87,9 +87,9 @@ R, L, K, J, B = TABLE_1["rear_left"]
 
 
 def loaded(load, *, counts, seed, least=-9.0, back=SECONDS):
-    """Return a motor under a load [of its friction], its speed a mean over ten rows, or counts.
+    """Return a record under a load relative to friction, with averaged speed or counts.
 
-    From ``back`` [s] on it is driven the other way.
+    The voltage is reversed from ``back`` [s] on.
     """
     rng = np.random.default_rng(seed)
     time = np.arange(RATE * SECONDS) / RATE
@@ -113,7 +113,7 @@ def stepped(at: float) -> np.ndarray:
 
 @pytest.mark.parametrize("at", [4.1, 9.3])
 @pytest.mark.parametrize("counts", [False, True])
-def test_a_load_that_steps_is_found_and_moves_no_number(counts, at):
+def test_step_load_is_found_without_parameter_bias(counts, at):
     found = estimate(loaded(stepped(at), counts=counts, seed=3))
     (words,) = [f for f in found.findings if f.code == "load_step"]
     assert abs(words.evidence["load_step_at"] * SECONDS - at) < 0.06 * SECONDS
@@ -124,19 +124,19 @@ def test_a_load_that_steps_is_found_and_moves_no_number(counts, at):
 
 
 @pytest.mark.parametrize(("counts", "back"), [(False, SECONDS), (True, SECONDS), (True, 9.4)])
-def test_of_a_motor_that_turns_one_way_the_friction_is_not_told_from_loads(counts, back):
-    """In one direction all the time, or reversed from the left-out part of the load on."""
+def test_step_load_does_not_bias_the_gain_of_a_motor_turning_one_way(counts, back):
+    """Driven in one direction throughout, or reversed shortly after the load step."""
     found = estimate(loaded(stepped(9.3), counts=counts, seed=5, least=3.0, back=back))
     motors.check(found, motors.truth("rear_left", STATIC), ["dc_gain"], floor=2e-3)
 
 
-def test_no_load_is_not_a_step():
+def test_load_step_is_not_reported_without_a_load():
     found = estimate(loaded(np.zeros(RATE * SECONDS), counts=False, seed=4))
     assert "load_step" not in {f.code for f in found.findings}
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_an_angle_that_wanders_under_torque_noise_shows_no_step(seed):
+def test_torque_noise_is_not_reported_as_a_load_step(seed):
     rng = np.random.default_rng(20 + seed)
     found = estimate(loaded(3.0 * rng.standard_normal(RATE * SECONDS), counts=True, seed=seed))
     codes = {f.code for f in found.findings}

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The estimator recovers known motors, or says that it cannot."""
+"""The estimator recovers known motors or reports them as unidentifiable."""
 
 import json
 from dataclasses import replace
@@ -38,7 +38,7 @@ def test_all_parameters_are_recovered_with_current_and_friction(wheel):
 
 
 @pytest.mark.parametrize("wheel", WHEELS)
-def test_voltage_and_speed_give_combinations_and_refuse_the_rest(wheel):
+def test_voltage_and_speed_alone_identify_only_parameter_combinations(wheel):
     result = estimate(motors.record(wheel, current=False))
     truth = motors.truth(wheel, 0.3)
     assert not result.identifiable
@@ -58,8 +58,8 @@ def test_a_linear_motor_is_recovered_without_friction():
 
 @pytest.mark.parametrize("wheel", WHEELS)
 @pytest.mark.parametrize("noise", [0.005, 0.05])
-def test_little_torque_noise_is_not_taken_for_much(wheel, noise):
-    """A poorer model calls for more: from there the walk must find back to the motor's own."""
+def test_small_torque_noise_is_not_overestimated(wheel, noise):
+    """A poorer model needs more process noise; the search must return to the true level."""
     found = estimate(
         motors.record(wheel, kinds=("fourier",), seconds=20.0, current=False, torque_noise=noise)
     )
@@ -69,7 +69,7 @@ def test_little_torque_noise_is_not_taken_for_much(wheel, noise):
     check(estimate(record), motors.truth(wheel, 0.3), ("dc_gain", "time_constant"))
 
 
-def test_torque_disturbance_widens_the_intervals_and_does_not_ruin_the_estimate():
+def test_torque_noise_widens_intervals_without_parameter_bias():
     quiet = estimate(motors.record("rear_right"))
     noisy = estimate(motors.record("rear_right", torque_noise=0.5))
     truth = motors.truth("rear_right", 0.3)
@@ -79,7 +79,7 @@ def test_torque_disturbance_widens_the_intervals_and_does_not_ruin_the_estimate(
     assert noisy.value("dc_gain") == pytest.approx(truth["dc_gain"], rel=5e-3)
 
 
-def test_a_command_that_switches_between_samples_is_put_where_it_switched():
+def test_mid_sample_command_switches_do_not_bias_the_parameters():
     fine = motors.record("front_left", rate=1000.0, seconds=5.0)
     late = np.roll(fine.voltage.reshape(-1, 5).mean(axis=1).repeat(5), 2)
     late[:2] = late[2]
@@ -93,7 +93,7 @@ def test_a_command_that_switches_between_samples_is_put_where_it_switched():
     check(estimate(coarse), motors.truth("front_left", 0.3), PHYSICAL)
 
 
-def test_fixed_resistance_is_reported_as_fixed_and_still_separates_nothing_without_current():
+def test_fixed_resistance_alone_separates_no_parameters_without_current():
     result = estimate(motors.record("rear_left", current=False), fixed={"resistance": 3.2843})
     assert result.parameters["resistance"].status == "fixed"
     assert result.parameters["resistance"].value == 3.2843
@@ -109,7 +109,9 @@ def test_fixed_resistance_is_reported_as_fixed_and_still_separates_nothing_witho
         ("front_right", 0.3, "auto", "motor_constant", 1e-4, 0.01),  # of a data sheet
     ],
 )
-def test_two_known_values_separate_the_rest(wheel, friction, model, other, floor, most):
+def test_two_known_parameters_make_the_others_identifiable(
+    wheel, friction, model, other, floor, most
+):
     truth = motors.truth(wheel, friction)
     recording = motors.record(wheel, current=False, static_voltage=friction)
     known = {n: truth[n] for n in ("resistance", other)}
@@ -118,7 +120,7 @@ def test_two_known_values_separate_the_rest(wheel, friction, model, other, floor
     motors.check(result, truth, names, sigmas=SIGMAS, floor=floor, most=most)
 
 
-def test_resistance_and_friction_fixed_leave_two_motors_and_are_refused():
+def test_fixed_resistance_and_viscous_friction_leave_parameters_unidentifiable():
     truth = motors.truth("front_left", 0.0)
     recording = motors.record("front_left", current=False, static_voltage=0.0)
     known = {n: truth[n] for n in ("resistance", "viscous_friction")}
@@ -127,7 +129,7 @@ def test_resistance_and_friction_fixed_leave_two_motors_and_are_refused():
     assert set(result.unidentifiable) >= {"motor_constant", "inertia", "inductance"}
 
 
-def test_a_current_that_is_rarely_there_is_not_used():
+def test_mostly_missing_current_is_not_used():
     recording = motors.record("rear_left")
     rare = np.where(np.arange(len(recording)) % 5 == 0, recording.current, np.nan)
     result = estimate(replace(recording, current=rare), model="second_order")
@@ -142,7 +144,7 @@ def test_fixed_resistance_with_current_is_kept():
     assert result.parameters["resistance"].status == "fixed"
 
 
-def test_several_records_have_their_own_beginnings():
+def test_records_with_different_initial_states_are_fitted_together():
     parts = [
         motors.record("rear_left", kinds=(k,), seed=n) for n, k in enumerate(("sine", "square"))
     ]
@@ -151,7 +153,7 @@ def test_several_records_have_their_own_beginnings():
     assert result.samples == 1900
 
 
-def test_a_speed_differenced_over_a_sample_is_late_by_half_of_it():
+def test_differenced_speed_has_half_a_sample_of_delay():
     recording = replace(motors.record("rear_left", current=False), count=None)
     result = estimate(recording)
     truth = motors.truth("rear_left", 0.3)
@@ -170,7 +172,7 @@ def test_outliers_do_not_move_a_robust_fit():
     assert result.value("resistance") == pytest.approx(3.2843, rel=0.01)
 
 
-def test_what_next_asks_for_current_where_there_was_none():
+def test_proposed_recording_measures_the_current_if_it_was_missing():
     result = estimate(motors.record("rear_left", current=False))
     proposal = what_next(result, accuracy=0.01)
     assert "with the motor current measured" in proposal.words
@@ -185,7 +187,7 @@ def test_records_without_a_signal_in_common_are_refused():
         estimate([counts, speed])
 
 
-def test_unknown_names_are_refused_by_name():
+def test_invalid_model_or_fixed_parameter_is_refused_by_name():
     recording = motors.record(seconds=1.0)
     with pytest.raises(ParameterError, match="third_order"):
         estimate(recording, model="third_order")
@@ -203,14 +205,14 @@ def test_unknown_names_are_refused_by_name():
         ({"inertia": (2.0, 1.0)}, True),
     ],
 )
-def test_bounds_that_cannot_be_kept_are_refused_by_name(bounds, current):
+def test_invalid_bounds_are_refused_by_name(bounds, current):
     with pytest.raises(ParameterError, match=next(iter(bounds))):
         estimate(motors.record("rear_left", current=current), bounds=bounds)
 
 
 @pytest.mark.parametrize("seed", [0, 3])
-def test_a_square_wave_without_current_does_not_lead_friction_astray(seed):
-    # Stopping and starting makes kinks; another minimum would be some 15 deviations away.
+def test_square_wave_without_current_does_not_bias_the_friction(seed):
+    # Stiction makes kinks; a wrong local optimum is some 15 standard deviations away.
     result = estimate(
         motors.record("front_right", current=False, kinds=("square",), seed=seed),
         model="second_order",
@@ -219,7 +221,7 @@ def test_a_square_wave_without_current_does_not_lead_friction_astray(seed):
     check(result, truth, ("dc_gain", "time_constant", "static_voltage"))
 
 
-def test_a_load_stronger_than_friction_is_accepted():
+def test_load_larger_than_friction_is_estimated():
     R, L, K, J, B, TC, load = 0.56, 7.7e-5, 0.044, 7.15e-5, 7.6e-4, 0.033, 0.04
     t = np.arange(1558) / 500.0
     up = np.linspace(0.0, 3.0, 7)

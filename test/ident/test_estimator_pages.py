@@ -68,7 +68,7 @@ def test_functions_are_drawn_in_the_order_in_which_they_are_called():
     assert drawn_at == sorted(drawn_at)
 
 
-def test_table_of_effects_is_the_catalogue():
+def test_table_of_effects_lists_the_whole_catalogue():
     rows = page("identification.md").split("## Effects that are found")[1].splitlines()
     cells = [line.split("|") for line in rows if line.startswith("| `")]
     codes = [code for row in cells for code in re.findall(r"`(\w+)`", row[1])]
@@ -77,7 +77,7 @@ def test_table_of_effects_is_the_catalogue():
     assert set(sizes) <= set(UNITS)
 
 
-def test_program_of_the_page_prints_what_the_page_shows(capsys):
+def test_example_program_prints_the_documented_output(capsys):
     text = page("identification.md")
     (program,) = fences(text, "python")
     (printed,) = fences(text, "text")

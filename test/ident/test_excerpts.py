@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Of a long recording stretches are used."""
+"""Long recordings are reduced to evenly spread excerpts."""
 
 import motors
 import numpy as np
@@ -13,13 +13,13 @@ from smp_motor_ident.record import Record
 SIGMAS = 4.0  # one of four quantities passes them by chance in 4,000 records; the seed is fixed
 
 
-def test_a_record_that_is_not_long_is_used_whole() -> None:
+def test_short_record_is_used_whole() -> None:
     record = motors.record(seconds=2.0)
     assert select_excerpts([record, record], 2 * len(record)) == [record, record]
     assert select_excerpts([]) == []
 
 
-def test_stretches_are_spread_evenly_over_a_long_record() -> None:
+def test_excerpts_are_spread_evenly_over_a_long_record() -> None:
     whole = motors.record(seconds=20.0)
     parts = select_excerpts([whole], 4_000)
     assert [len(part) for part in parts] == STRETCH_COUNT * [500]
@@ -31,19 +31,19 @@ def test_stretches_are_spread_evenly_over_a_long_record() -> None:
     assert found.evidence == {"rows": 12_000.0, "used": 4_000.0}
 
 
-def test_records_share_the_rows_by_their_length_and_short_ones_stay_whole() -> None:
+def test_excerpt_rows_are_allotted_by_length_and_short_records_kept_whole() -> None:
     whole = motors.record(seconds=20.0)
     parts = select_excerpts([whole, whole.slice(0, 6_000), whole.slice(0, 60)], 4_000)
     assert [len(part) for part in parts] == [*3 * [885], *3 * [442], 60]
 
 
-def test_the_stretches_of_a_long_record_tell_its_motor() -> None:
+def test_motor_is_identified_from_excerpts_of_a_long_record() -> None:
     found = estimate(select_excerpts([motors.record(seconds=20.0, current=False)], 4_000))
     names = ("dc_gain", "time_constant", "time_constant_product", "static_voltage")
     motors.check(found, motors.truth("rear_left", 0.3), names, sigmas=SIGMAS)
 
 
-def test_identify_uses_and_shows_stretches_of_a_long_record() -> None:
+def test_identify_fits_and_shows_excerpts_of_a_long_record() -> None:
     rows = round(1.2 * MAX_EXCERPT_ROWS)
     rng = np.random.default_rng(0)
     time = 0.001 * np.arange(rows)

@@ -39,7 +39,7 @@ def test_clean_data_have_no_finding_beyond_a_note():
     assert [f for f in result.findings if f.severity != "note"] == []
 
 
-def test_the_curves_agree_with_the_verdict():
+def test_autocorrelation_curve_agrees_with_the_whiteness_verdict():
     result = estimate(motors.record("rear_left", seconds=8.0))
     curve = result.residuals.autocorrelation
     inside = bool(np.all(np.abs(curve.value[1:]) < curve.band))
@@ -55,8 +55,8 @@ def test_findings_of_the_reader_are_kept():
 
 
 @pytest.mark.parametrize("share", [0.0, 0.1, 1.0])
-def test_a_speed_that_is_filtered_may_be_the_sensors_lag(share):
-    """One lag and a part of it more, under a random voltage of two sizes, solved exactly."""
+def test_time_constant_uncertainty_covers_a_lag_of_the_speed_sensor(share):
+    """A motor lag and a filter lag of ``share`` of it, under random voltage, solved exactly."""
     rate, lag, rng = 500.0, 0.05, np.random.default_rng(5)
     voltage = np.repeat(rng.choice([-8.0, -4.0, 4.0, 8.0], 60), 40)
     motor = np.polymul([lag, 1.0], [0.02 * lag, 1.0])  # with a winding
@@ -72,14 +72,14 @@ def test_a_speed_that_is_filtered_may_be_the_sensors_lag(share):
         assert abs(motor.value - 1.02 * lag) < 2.5 * motor.total_std
 
 
-def test_a_motor_that_rings_has_a_winding_and_no_filter():
+def test_underdamped_motor_is_not_reported_as_filtered_speed():
     # Motor 1 of Table 1: L/R of 24 ms, R J / (K^2 + R b) of 34 ms, damping 0.90.
     found = estimate(replace(motors.record("front_left", seconds=8.0), current=None)).findings
     assert not [f for f in found if f.code == "low_passed_speed"]
 
 
 @pytest.mark.parametrize(("scale", "severity"), [(1.0, "note"), (1.3, "unreliable")])
-def test_a_current_whose_scale_an_ohmmeter_shows(scale, severity):
+def test_current_scale_error_is_found_from_a_measured_resistance(scale, severity):
     made = motors.record("rear_left", seconds=3.0)
     ohm = motors.truth("rear_left", 0.3)["resistance"]
     measured = replace(
@@ -89,21 +89,21 @@ def test_a_current_whose_scale_an_ohmmeter_shows(scale, severity):
     about = next(f for f in found.findings if f.code == "current_scale")
     assert about.severity == severity
     assert ("measure the resistance warm" in about.advice) is (severity == "unreliable")
-    # R/s: of s the intervals of R at hand leave far less than a hundredth open.
+    # The interval of R determines the scale to far better than a hundredth.
     assert abs(about.evidence["scale"] - scale) < 0.01
     assert "resistance" in about.evidence["of_the_scale"]
     assert "motor_constant" not in about.evidence["of_the_scale"]
 
 
 @pytest.mark.parametrize(("kind", "severity"), [("square", "warning"), ("fourier", "note")])
-def test_a_current_of_the_supply_looks_like_a_scale_under_one_size(kind, severity):
+def test_supply_current_is_confounded_with_scale_under_one_voltage_amplitude(kind, severity):
     found = estimate(motors.record("rear_left", kinds=(kind,), seconds=3.0))
     about = next(f for f in found.findings if f.code == "current_scale")
     assert about.severity == severity
     assert ("supply" in about.message) is (severity == "warning")
 
 
-def test_a_current_of_mostly_noise_is_not_a_poor_fit():
+def test_noisy_current_is_not_reported_as_poor_fit():
     good = motors.record("rear_left", seconds=3.0)
     noise = 3.0 * np.std(good.current) * np.random.default_rng(0).standard_normal(len(good))
     found = estimate(replace(good, current=good.current + noise))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Many recordings: each by itself, kept once it is known, compared in one table."""
+"""Fleets of recordings: separate identification, caching, comparison in one table."""
 
 import csv
 import os
@@ -21,12 +21,12 @@ from smp_motor_ident.result import Quantity
 
 
 def gain(value: float, std: float = 0.05) -> Quantity:
-    """A gain as an estimate states it."""
+    """Return a gain as an estimate states it."""
     return Quantity(value, std, (value - 2 * std, value + 2 * std), "rad/s/V")
 
 
 def rows(slope: float, seed: int = 0, robot: str = "one", level: float = 25.0) -> list[Row]:
-    """Ten recordings of a motor on as many days."""
+    """Return ten recordings of a motor on ten days."""
     rng = np.random.default_rng(seed)
     return [
         Row(robot, "front_left", f"bag{k}", k * DAY,
@@ -35,8 +35,8 @@ def rows(slope: float, seed: int = 0, robot: str = "one", level: float = 25.0) -
     ]  # fmt: skip
 
 
-def test_a_motor_that_drifts_is_told_from_those_that_do_not():
-    # Of a hundred motors that stay, none: 100 times 6 in 100,000.
+def test_drifting_motor_is_found_among_steady_ones():
+    # False alarms among 100 steady motors: 100 times 6 in 100,000.
     steady = [row for k in range(100) for row in rows(0.0, k, f"robot{k}")]
     (mark,) = drifts([*steady, *rows(-0.001, 7, "worn")])
     assert (mark.robot, mark.quantity) == ("worn", "dc_gain")
@@ -55,7 +55,7 @@ def test_recordings_without_a_date_are_not_compared_over_time():
     assert "10 without a date" in page(undated, [])
 
 
-def test_a_motor_unlike_the_others_stands_out_and_a_few_robots_are_not_compared():
+def test_outlier_motor_is_found_only_with_enough_robots():
     rng = np.random.default_rng(3)
     same = [row for k in range(8) for row in rows(0.0, k, f"r{k}", 25 + float(rng.normal(0, 0.3)))]
     other = rows(0.0, 9, "other", 28.0)
@@ -65,7 +65,7 @@ def test_a_motor_unlike_the_others_stands_out_and_a_few_robots_are_not_compared(
 
 
 def fake(path: str, settings: tuple[Any, ...]) -> list[Row]:
-    """A recording as its file says: broken, deadly once, or a motor."""
+    """Identify a fake recording: broken, killing its worker once, or valid."""
     with (Path(path).parent / "log").open("a") as log:
         log.write(Path(path).name + "\n")
     text = Path(path).read_text()
@@ -114,7 +114,7 @@ MAPPED = ["--map", "time=t", "voltage=u", "velocity=w"]
 MONDAY = 1_788_767_600.0  # 2026-09-07 07:53:20 UTC
 
 
-def test_signals_are_mapped_alike_for_every_recording(tmp_path):
+def test_one_signal_mapping_applies_to_every_recording(tmp_path):
     bags = [str(write_steps(tmp_path / name / "a.csv", 12.0)) for name in ("one", "two")]
     assert main([*bags, "--fleet", *MAPPED, "--output", str(tmp_path / "out"), "--quiet"]) == 0
     table = list(csv.DictReader((tmp_path / "out" / "fleet.csv").open()))
@@ -123,10 +123,10 @@ def test_signals_are_mapped_alike_for_every_recording(tmp_path):
     assert [float(r["dc_gain"]) for r in table] == pytest.approx([25.0, 25.0], rel=0.01)
     assert all(float(r["dc_gain_low"]) < float(r["dc_gain"]) < float(r["dc_gain_high"])
                for r in table)  # fmt: skip
-    assert [r["date"] for r in table] == ["", ""]  # stamps from 0 are no date
+    assert [r["date"] for r in table] == ["", ""]  # stamps from 0 are not a date
 
 
-def test_a_recording_has_its_own_time_and_its_numbers_are_printed_with_units(tmp_path, capsys):
+def test_recording_date_is_read_and_results_are_printed_with_units(tmp_path, capsys):
     bags = [
         write_steps(tmp_path / robot / f"day{day}.csv", 12.0, begin=MONDAY + DAY * day)
         for robot in ("one", "two")
@@ -154,7 +154,7 @@ def test_a_recording_has_its_own_time_and_its_numbers_are_printed_with_units(tmp
 
 
 @pytest.mark.skipif(not CHROMIUM, reason="no Chromium on this machine")
-def test_the_table_is_read_whole_on_a_screen_and_on_a_phone(tmp_path):
+def test_fleet_table_fits_screen_and_phone_widths(tmp_path):
     units = {"dc_gain": "rad/s/V", "time_constant": "s", "static_voltage": "V", "resistance": "ohm"}
     numbers = {
         name: Quantity(25.54832, 0.00079, (25.54678, 25.54986), unit)

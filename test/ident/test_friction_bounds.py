@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What feed-forward may take for known of dry friction, by the interval that the estimate gives."""
+"""Friction compensation in feed-forward, bounded by the interval of the estimate."""
 
 import math
 
@@ -25,7 +25,7 @@ def test_a_standard_deviation_alone_gives_a_normal_interval():
 
 
 @pytest.mark.parametrize(("half", "known"), [(0.239, True), (0.241, False)])
-def test_friction_is_known_to_a_fiftieth_of_the_supply(half, known):
+def test_friction_is_known_if_its_interval_is_within_2_percent_of_supply(half, known):
     found = bound_friction(estimate(Quantity(1.0, 0.1, (1.0 - half, 1.0 + half))), SUPPLY)
     assert found.known == (1.0 if known else 1.0 - half)
     assert found.planned == (1.0 if known else 1.0 + half)
@@ -35,7 +35,7 @@ def test_friction_is_known_to_a_fiftieth_of_the_supply(half, known):
         assert found.finding.evidence == {"low": 1.0 - half, "high": 1.0 + half}
 
 
-def test_friction_is_neither_negative_nor_above_the_supply():
+def test_friction_interval_is_clipped_to_zero_and_supply():
     found = bound_friction(estimate(Quantity(0.1, 0.5, (-0.9, 1.1))), SUPPLY)
     assert (found.low, found.high) == (0.0, 1.1)
     found = bound_friction(estimate(Quantity(10.0, 2.0, (8.0, 14.0))), SUPPLY)
@@ -45,7 +45,7 @@ def test_friction_is_neither_negative_nor_above_the_supply():
 
 
 @pytest.mark.parametrize(("width", "refused"), [(5.99, False), (6.01, True)])
-def test_half_of_the_supply_is_too_much_not_to_know(width, refused):
+def test_friction_interval_wider_than_half_the_supply_is_refused(width, refused):
     given = estimate(Quantity(None, None, (0.0, width), status="unidentifiable"))
     if refused:
         with pytest.raises(DesignError, match=r"anything from 0 to 6\.01 V of the 12 V supply"):
@@ -54,7 +54,7 @@ def test_half_of_the_supply_is_too_much_not_to_know(width, refused):
         assert bound_friction(given, SUPPLY).high == width
 
 
-def test_friction_that_was_not_identified_is_left_to_the_integral():
+def test_unidentified_friction_is_left_to_integral_action():
     found = bound_friction(estimate(None), SUPPLY)
     assert (found.known, found.low, found.high) == (0.0, 0.0, 0.0)
     assert found.finding is not None and found.finding.code == "friction_unknown"
@@ -63,7 +63,7 @@ def test_friction_that_was_not_identified_is_left_to_the_integral():
             bound_friction(estimate(nothing), SUPPLY)
 
 
-def test_friction_as_a_torque_is_taken_through_resistance_and_motor_constant():
+def test_friction_torque_is_converted_to_voltage_by_resistance_and_motor_constant():
     parts = {"resistance": Quantity(12.0, 0.0), "motor_constant": Quantity(0.02, 0.0)}
     given = estimate(None, coulomb_friction=Quantity(1e-3, 1e-5), **parts)
     found = bound_friction(given, SUPPLY)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Readings that jump away and back within a sample are left out; real motion is not."""
+"""Outliers that return within a sample are removed; real motion is not."""
 
 import numpy as np
 import pytest
@@ -30,19 +30,19 @@ def glitched(record: Record, share: float, size: float, seed: int = 0) -> Record
 
 @pytest.mark.parametrize(("share", "size"), [(0.001, 700.0), (0.005, 700.0), (0.02, 1e4)])
 @pytest.mark.parametrize("seed", range(2))
-def test_numbers_are_right_without_the_glitches_that_are_named(seed, share, size):
+def test_glitches_are_reported_and_do_not_bias_the_estimate(seed, share, size):
     found = estimate(glitched(recorded(seed), share, size, seed))
     (words,) = [f for f in found.findings if f.code == "glitches"]
     assert words.severity == "warning" and words.evidence["signal"] == "velocity"
     assert not found.unreliable
-    # Readings within a twentieth of the range of the speed stay, and cost certainty.
+    # Outliers within a twentieth of the speed range remain and widen the intervals.
     check(found, {"dc_gain": GAIN, "time_constant": TAU}, most=0.01)
 
 
 @pytest.mark.parametrize(
     "kind",
     [{}, {"noise": 0.0}, {"noise": 30.0}, {"hold": 1}, {"tau": 1e-3}, {"tau": 1e-3, "hold": 1}],
-    ids=["usual", "no noise", "noise", "a level a sample", "fast", "fast, a level a sample"],
+    ids=["usual", "no noise", "noise", "level per sample", "fast", "fast, level per sample"],
 )
 @pytest.mark.parametrize("seed", range(5))
 def test_noise_and_fast_motion_are_not_glitches(seed, kind):
@@ -51,7 +51,7 @@ def test_noise_and_fast_motion_are_not_glitches(seed, kind):
 
 
 @pytest.mark.parametrize("quantum", [0.1, 2.0, 20.0])
-def test_a_speed_in_steps_has_no_glitches(quantum):
+def test_quantised_speed_has_no_glitches(quantum):
     record = recorded(3)
     coarse = Record(
         "motor", record.time, record.voltage,
@@ -68,7 +68,7 @@ def test_the_response_to_a_short_pulse_is_not_a_glitch():
     assert remove_glitches(record) is record
 
 
-def test_several_in_a_row_are_all_left_out_of_an_angle():
+def test_consecutive_glitches_of_an_angle_are_removed():
     record = recorded(1)
     angle = np.cumsum(record.velocity) * STEP
     wrong = angle.copy()
@@ -79,7 +79,7 @@ def test_several_in_a_row_are_all_left_out_of_an_angle():
     np.testing.assert_array_equal(np.delete(cleaned.position, lost), np.delete(angle, lost))
 
 
-def test_a_sensor_that_is_wrong_too_often_is_left_as_it_is():
+def test_frequent_outliers_are_not_removed_as_glitches():
     record = glitched(recorded(2), 0.15, 700.0)
     assert remove_glitches(record) is record
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The tool ``identify`` as its user meets it: files, exit codes, one-line complaints."""
+"""The command ``identify``: files, exit codes, one-line errors."""
 
 import json
 import os
@@ -36,7 +36,7 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def complaint(capsys: pytest.CaptureFixture[str]) -> str:
-    """The one line on standard error."""
+    """Return the only line on standard error."""
     lines = capsys.readouterr().err.strip().splitlines()
     lines = [line for line in lines if not line.endswith(" ...")]  # progress of slow steps
     assert len(lines) == 1, lines
@@ -45,7 +45,7 @@ def complaint(capsys: pytest.CaptureFixture[str]) -> str:
     return lines[0]
 
 
-def test_many_short_steps_do_not_run_in_silence(capsys, monkeypatch):
+def test_progress_is_repeated_during_many_short_steps(capsys, monkeypatch):
     monkeypatch.setattr(frame, "SILENCE_S", 1.0)
     said, end = "", time.monotonic() + 20.0
     with frame.progress("identify", takes="10 s") as say:
@@ -57,7 +57,7 @@ def test_many_short_steps_do_not_run_in_silence(capsys, monkeypatch):
     assert said.splitlines()[:2] == [first, "identify: fitting friction ..."]
 
 
-def test_it_writes_its_three_files_and_recovers_the_motor(recording, tmp_path):
+def test_identify_writes_its_three_files_and_recovers_the_motor(recording, tmp_path):
     output = tmp_path / "result"
     assert main([str(recording), *MAP, "--output", str(output)]) == 0
     assert sorted(p.name for p in output.iterdir()) == sorted(OUTPUTS)
@@ -105,7 +105,7 @@ def test_terminal_json_and_page_state_the_same_numbers(recording, tmp_path, caps
             assert float(written) == pytest.approx(stated, abs=0.501 * digit)
 
 
-def test_terminal_shows_the_three_gravest_messages(recording, tmp_path, monkeypatch, capsys):
+def test_terminal_shows_the_three_most_severe_findings(recording, tmp_path, monkeypatch, capsys):
     findings = [
         *(Finding(f"note_{k}", "note", f"note {k} of dc_gain") for k in range(2)),
         *(Finding(f"odd_{k}", "warning", f"warning {k}", {}, f"do {k}") for k in range(3)),
@@ -131,7 +131,7 @@ def test_terminal_shows_the_three_gravest_messages(recording, tmp_path, monkeypa
     assert "6. Note: Note 1 of DC gain." in said.out
 
 
-def test_it_replaces_nothing_without_force(recording, tmp_path, capsys):
+def test_existing_files_are_overwritten_only_with_force(recording, tmp_path, capsys):
     (tmp_path / "motors.yaml").write_text("mine")
     arguments = [str(recording), *MAP, "--output", str(tmp_path), "--quiet"]
     assert main(arguments) == 2
@@ -168,12 +168,12 @@ def test_wrong_usage_is_refused(arguments, word, recording, tmp_path, monkeypatc
     assert not (tmp_path / "result").exists()
 
 
-def test_without_output_it_asks_for_one(recording, capsys):
+def test_missing_output_option_is_refused(recording, capsys):
     assert main([str(recording), *MAP]) == 2
     assert "--output" in complaint(capsys)
 
 
-def test_a_motor_that_was_not_moved_is_refused_with_advice(tmp_path, capsys):
+def test_recording_of_a_motor_at_rest_is_refused_with_advice(tmp_path, capsys):
     still = write_steps(tmp_path / "still.csv", level=0.0)
     assert main([str(still), *MAP, "--output", str(tmp_path / "result")]) == 1
     assert "record" in complaint(capsys)
@@ -196,7 +196,7 @@ def test_good_wheels_are_written_when_another_is_refused(tmp_path, capsys):
     assert "not identified" in (output / "report.html").read_text()
 
 
-def test_another_recording_judges_the_model(recording, tmp_path):
+def test_model_is_validated_on_a_separate_recording(recording, tmp_path):
     other = write_steps(tmp_path / "other.csv", seed=2)
     output = tmp_path / "result"
     arguments = [str(recording), *MAP, "--validate", str(other), "--output", str(output)]
@@ -207,7 +207,7 @@ def test_another_recording_judges_the_model(recording, tmp_path):
     assert "other.csv" in (output / "report.html").read_text()
 
 
-def test_the_executable_complains_without_a_traceback(process, tmp_path):
+def test_executable_reports_an_unreadable_bag_without_traceback(process, tmp_path):
     (tmp_path / "not_a_bag.mcap").write_bytes(b"not a bag at all")
     tool = process("identify", "not_a_bag.mcap", "--output", "result")
     assert tool.wait(60.0) == 2
@@ -234,7 +234,7 @@ def found(severity: str) -> Estimate:
         ("unreliable", ("--accept-unreliable",), 0),
     ],
 )
-def test_an_unreliable_answer_is_written_and_ends_with_one_unless_accepted(
+def test_unreliable_result_is_written_with_exit_code_1_unless_accepted(
     severity, options, code, recording, tmp_path, monkeypatch, capsys
 ):
     monkeypatch.setattr(identification, "estimate", lambda *_, **__: found(severity))
@@ -242,7 +242,7 @@ def test_an_unreliable_answer_is_written_and_ends_with_one_unless_accepted(
     assert main([str(recording), *MAP, "--output", str(output), "--quiet", *options]) == code
     said = capsys.readouterr().err
     assert ("Record a slow ramp." in said) == (code == 1)
-    assert "a dead zone of 1 V" not in said  # which the report and the table above it tell
+    assert "a dead zone of 1 V" not in said  # stated in the report and in the table above
     (motor,) = json.loads((output / "identification.json").read_text())["motors"].values()
     assert motor["findings"][0]["severity"] == severity
     page = (output / "report.html").read_text()
@@ -250,7 +250,7 @@ def test_an_unreliable_answer_is_written_and_ends_with_one_unless_accepted(
     assert "Record a slow ramp." in page
 
 
-def test_a_reader_that_has_gone_does_not_change_the_answer(recording, tmp_path):
+def test_closed_standard_output_does_not_change_the_exit_code(recording, tmp_path):
     command = [sys.executable, "-m", "smp_motor_ident.cli.identify", str(recording), *MAP]
     tool = subprocess.Popen(
         [*command, "--output", str(tmp_path / "result")], stdout=subprocess.PIPE, stderr=PIPE
@@ -262,8 +262,8 @@ def test_a_reader_that_has_gone_does_not_change_the_answer(recording, tmp_path):
 
 
 @pytest.mark.parametrize("tool", ["identify", "commission", "demo"])
-def test_help_loads_nothing_that_computes(tool):
-    # What takes the time is known; a time would depend on what else this machine does.
+def test_help_imports_no_numerical_modules(tool):
+    # Imports are checked, since a duration would depend on the load of the machine.
     program = (
         f"import sys\nfrom smp_motor_ident.cli.{tool} import main\nassert main(['--help']) == 0\n"
         "slow = {'numpy', 'scipy', 'numba', 'rosbags', 'matplotlib', 'yaml', 'rich', 'jinja2'}\n"
@@ -273,7 +273,7 @@ def test_help_loads_nothing_that_computes(tool):
 
 
 @pytest.mark.parametrize("node", ["record", "play"])
-def test_nodes_for_messages_load_no_numerical_modules(node):
+def test_record_and_play_nodes_import_no_numerical_modules(node):
     slow = "assert not {'scipy', 'numba', 'matplotlib'} & set(sys.modules)"
     program = f"import sys\nimport smp_motor_ident.nodes.{node}\n{slow}\n"
     subprocess.run([sys.executable, "-c", program], check=True)
@@ -292,7 +292,7 @@ def test_paths_that_are_not_utf_8_are_read_and_written(recording, tmp_path):
     assert tune.main([str(output), "--supply", "12", "--output", f"{output}.yaml"]) == 0
 
 
-def test_a_place_where_nothing_can_be_written_is_told_before_the_work(recording, tmp_path, capsys):
+def test_unwritable_output_is_refused_before_computing(recording, tmp_path, capsys):
     nowhere = "/proc/self/nothing"  # where not even root may write
     assert main([str(tmp_path / "no.csv"), *MAP, "--output", nowhere]) == 2
     assert "cannot be written" in capsys.readouterr().err

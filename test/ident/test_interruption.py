@@ -16,12 +16,12 @@ from smp_motor_ident.cli import frame, interruption
 
 
 class Thing:
-    """Something that can be weakly referred to."""
+    """An object that supports weak references."""
 
 
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
-def test_a_signal_inside_a_callback_that_cannot_raise_is_raised_at_the_next_look(number):
+def test_signal_in_a_non_raising_callback_is_raised_at_the_next_check(number):
     def in_callback(_: object) -> None:
         os.kill(os.getpid(), number)
         for _ in range(1000):
@@ -43,7 +43,7 @@ def test_an_interruption_is_cleared_after_the_block():
         interruption.check()
 
 
-def test_an_inner_block_does_not_make_the_outer_forget():
+def test_interruption_of_an_inner_block_reaches_the_outer_block():
     with interruption.interruptible():
         with pytest.raises(KeyboardInterrupt), interruption.interruptible():
             os.kill(os.getpid(), signal.SIGINT)
@@ -71,7 +71,7 @@ def test_a_protected_block_is_completed_before_an_interruption():
     assert done
 
 
-def test_an_error_behind_an_interruption_that_was_dropped_is_that_interruption(capsys):
+def test_error_after_a_suppressed_interruption_is_reported_as_interruption(capsys):
     def compiles(arguments: argparse.Namespace) -> int:
         with contextlib.suppress(KeyboardInterrupt):  # as a callback of a compiler does
             signal.raise_signal(signal.SIGTERM)

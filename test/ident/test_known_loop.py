@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A loop that is known gives its commands back from set-points and speeds alone."""
+"""Commands of a known controller are reconstructed from set-points and speeds."""
 
 import json
 import math
@@ -18,7 +18,7 @@ from smp_motor_ident.tune.known_loop import reconstruct
 
 ROOT = Path(__file__).resolve().parents[2]
 GAIN, LAG, FAST, SUPPLY = 25.0, 0.09, 1e-4, 12.0
-"""Of the motor [rad/s/V], [s], [s], and its supply [V]."""
+"""Gain [rad/s/V], lags [s] and supply [V] of the motor."""
 
 LOOPS = {
     "linorobot2": (0.02, {"K_P": 20.0, "K_I": 4.0, "K_D": 0.0, "PWM_BITS": 10}, 60 / (2 * math.pi)),
@@ -86,13 +86,13 @@ def test_the_command_is_reconstructed(name):
     # Nine digits, as logs have them.
     rounded = np.array([float(f"{v:.9g}") for v in speed])
     got = reconstruct(record(time, setpoints, rounded), FORMATS[name].known, given(name))
-    # Of two independent writings of the rule; a whole number may fall to the other side once.
+    # Two independent implementations of the rule; integers may round differently once.
     assert np.mean(np.abs(got.voltage[1:] - volts[:-1]) > 0.05) < 0.01
     assert [f.code for f in got.findings] == ["reconstructed_voltage"]
 
 
 @pytest.mark.parametrize("name", ["linorobot2", "arduino_pid"])
-def test_the_motor_is_identified_through_the_loop(name, tmp_path):
+def test_motor_is_identified_from_reconstructed_commands(name, tmp_path):
     time, setpoints, speed, _ = drive(name)
     log = tmp_path / "log.csv"
     np.savetxt(log, np.column_stack((time, setpoints, speed)), delimiter=",", comments="",
@@ -109,14 +109,14 @@ def test_the_motor_is_identified_through_the_loop(name, tmp_path):
         found = motor["combinations"][key]
         # Four standard deviations: 1 in 16,000 by chance, and the seed is fixed.
         assert abs(found["value"] - truth) < 4 * found["std"]
-        # What part of a period of 20 ms passes before the driver acts is not known.
+        # The delay of the driver within a period of 20 ms is unknown.
         assert found["std"] < 0.02 * truth + (0.1 * 0.02 if key == "time_constant" else 0.0)
-    # Its speeds are whole ticks: a gain from 20 s of counts, not from speeds rounded one by one.
+    # Speeds are whole ticks: the gain comes from 20 s of counts, not from rounded speeds.
     assert motor["combinations"]["dc_gain"]["std"] < 1e-4 * GAIN
     assert "reconstructed_voltage" in [f["code"] for f in motor["findings"]]
 
 
-def test_unknown_commands_are_refused():
+def test_commands_that_cannot_be_reconstructed_are_refused():
     loop, numbers = FORMATS["arduino_pid"].known, given("arduino_pid")
     time, setpoints, speed, _ = drive("arduino_pid", 6.0)
     whole = record(time, setpoints, speed)
@@ -131,7 +131,7 @@ def test_unknown_commands_are_refused():
         reconstruct(coarse, loop, numbers)
 
 
-def test_a_lost_sample_ends_the_known_part_of_the_loop():
+def test_reconstruction_ends_at_a_lost_sample():
     time, setpoints, speed, volts = drive("arduino_pid", 6.0)
     kept = np.arange(time.size) != 300
     one = record(time[kept], setpoints[kept], speed[kept])
@@ -148,12 +148,12 @@ def test_a_lost_sample_ends_the_known_part_of_the_loop():
         (["arduino", "Kp=1"], "must be one of"),
     ],
 )
-def test_a_loop_that_is_not_given_whole_is_refused(arguments, complaint, tmp_path, capsys):
+def test_incomplete_or_unknown_controller_gains_are_refused(arguments, complaint, tmp_path, capsys):
     assert main(["log.csv", "--controller", *arguments, "--output", str(tmp_path / "r")]) == 2
     assert complaint in capsys.readouterr().err
 
 
-def test_set_points_of_another_topic_are_refused(tmp_path, capsys):
+def test_set_points_and_speeds_from_different_topics_are_refused(tmp_path, capsys):
     code = main(["bag", "--controller", "linorobot2", "K_P=1", "K_I=1", "--output",
                  str(tmp_path / "r"), "--map", "setpoint=/cmd.data",
                  "velocity=/state.speed"])  # fmt: skip

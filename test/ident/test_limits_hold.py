@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Limits of the answer that no other test shows, through `estimate` alone."""
+"""Limits that no other test covers, checked through `estimate` alone."""
 
 from dataclasses import replace
 
@@ -17,7 +17,7 @@ def share_of(quantity: Quantity, cause: str) -> Share | None:
 
 @pytest.mark.parametrize("scale", [0.96, 1.04])
 def test_scale_error_of_a_current_is_within_the_systematic_uncertainty(scale):
-    # 4 %: the tolerance that a Hall sensor is sold with.
+    # 4 %: the specified tolerance of a Hall sensor.
     made = motors.record("rear_left", seconds=3.0)
     truth = motors.truth("rear_left", 0.3)
     found = estimate(replace(made, current=scale * made.current)).parameters
@@ -26,19 +26,19 @@ def test_scale_error_of_a_current_is_within_the_systematic_uncertainty(scale):
         assert low < truth[name] < high
         share = share_of(found[name], "current_scale")
         assert share.size == pytest.approx(0.03 * value)
-        # The scale is no scatter: the random interval does not reach the truth.
+        # A scale error is not random: the random interval excludes the truth.
         assert abs(value - truth[name]) > NORMAL_95 * (found[name].std or 0.0)
     assert share_of(found["motor_constant"], "current_scale") is None
 
 
-def test_accuracy_of_the_current_that_is_stated_replaces_the_assumed_one():
+def test_stated_current_accuracy_replaces_the_assumed_one():
     made = motors.record("rear_left", seconds=3.0)
     stated = replace(made, hardware=replace(made.hardware, current_accuracy=0.2))
     share = share_of(estimate(stated).parameters["resistance"], "current_scale")
     assert share is not None and share.share == pytest.approx(0.2)
 
 
-def test_gain_at_one_amplitude_is_sharp_and_states_where_it_holds():
+def test_gain_at_one_amplitude_has_a_narrow_interval_and_a_stated_range():
     made = motors.record("rear_left", current=False, kinds=("square",), seconds=10.0)
     found = estimate(made)
     gain = found.combinations["dc_gain"]
@@ -53,15 +53,15 @@ def test_gain_at_one_amplitude_is_sharp_and_states_where_it_holds():
     assert measured is None or measured.size == pytest.approx(0.1 * one_size.size, rel=0.05)
 
 
-def test_a_motor_that_friction_nearly_holds_is_unreliable():
+def test_estimate_is_unreliable_if_friction_dominates_the_voltage():
     held = estimate(motors.record("rear_left", static_voltage=5.5, seconds=4.0))
     assert next(f for f in held.findings if f.code == "friction_dominates").severity == "unreliable"
     turns = estimate(motors.record("rear_left", static_voltage=4.5, seconds=4.0))
     assert "friction_dominates" not in [f.code for f in turns.findings]
 
 
-def test_instant_of_a_reading_is_within_the_systematic_uncertainty():
-    """A reading that is late by some of a row looks like as much less lag."""
+def test_sampling_instant_error_is_part_of_the_systematic_uncertainty():
+    """A delay of the readings is confounded with the time constant."""
     made = replace(motors.record("rear_left", current=False), velocity=None)
     known = replace(made, hardware=replace(made.hardware, timing_accuracy=0.0))
     moves = [

@@ -23,7 +23,7 @@ def state(voltage, current, velocity, position, count):
 
 
 def filled(seconds: float, voltage: object = None, length: float = 60.0) -> Window:
-    """A window that saw a motor of 25 rad/s/V without lag."""
+    """Return a window filled by a motor of 25 rad/s/V without lag."""
     window = Window("front_left", length)
     window.hardware = Hardware(RATIO, COUNTS, 16, 12.0)
     time = np.arange(round(seconds / STEP)) * STEP
@@ -45,12 +45,12 @@ def test_record_is_at_the_motor_shaft_with_counts_unwrapped():
     assert record.current is None
     np.testing.assert_allclose(record.velocity, 25 * record.voltage, rtol=1e-12)
     assert np.abs(np.diff(record.count)).max() < 2**15
-    # Counts and speed tell the same motion, to one count per sample of quantisation.
+    # Counts and speed agree to one count per sample of quantisation.
     moved = np.diff(record.count) * 2 * np.pi / COUNTS / STEP
     assert np.abs(moved - record.velocity[1:]).max() < 2 * np.pi / COUNTS / STEP * 1.01
 
 
-def test_voltages_that_differ_by_a_rounding_are_one_level():
+def test_voltages_equal_to_rounding_count_as_one_level():
     for volts in (12.0, -3.3, 1e-3):
         voltage = np.full(2000, volts)
         voltage[::7] = np.nextafter(volts, np.inf)
@@ -59,7 +59,7 @@ def test_voltages_that_differ_by_a_rounding_are_one_level():
 
 
 @pytest.mark.parametrize("volts", [np.nan, np.inf, -1e308, 1e308, 1e9])
-def test_an_impossible_voltage_is_not_a_sample(volts):
+def test_sample_with_impossible_voltage_is_discarded(volts):
     window = filled(20.0)
     before = len(window)
     window.add(NOW + 20 * SECOND, state(volts, np.nan, 0.0, 0.0, 0))
@@ -72,7 +72,7 @@ def test_window_keeps_only_its_length():
     assert record.duration == pytest.approx(10.0, abs=2 * STEP)  # whole samples
 
 
-def test_a_gap_begins_a_segment_and_a_late_sample_is_left_out():
+def test_gap_begins_a_segment_and_out_of_order_sample_is_discarded():
     window = filled(5.0)
     before = len(window)
     window.add(NOW + 2 * SECOND, state(1.0, np.nan, 0.0, 0.0, 0))
@@ -83,7 +83,7 @@ def test_a_gap_begins_a_segment_and_a_late_sample_is_left_out():
     assert record.starts == (0, before)
 
 
-def test_samples_that_come_late_from_a_busy_machine_begin_no_segment():
+def test_delayed_samples_of_a_busy_machine_begin_no_segment():
     # Every fiftieth sample is taken six intervals late, and the next ones catch up.
     window = Window("front_left", 60.0)
     window.hardware = Hardware(RATIO, COUNTS, 16, 12.0)
@@ -111,7 +111,7 @@ def test_samples_without_voltage_are_left_out():
     assert len(window) == before
 
 
-def test_rich_motion_meets_every_demand():
+def test_rich_excitation_meets_all_requirements():
     assert find_missing_excitation(filled(10.0).record()) == []
 
 
@@ -129,17 +129,17 @@ def test_missing_excitation_is_named(seconds, voltage, word):
     assert word in "; ".join(find_missing_excitation(filled(seconds, voltage).record()))
 
 
-def test_nothing_heard_is_named():
+def test_missing_motor_state_is_reported():
     assert find_missing_excitation(Window("w", 5.0).record()) == ["no motor_state yet"]
 
 
-def test_demands_do_not_depend_on_the_unit_of_speed():
+def test_excitation_requirements_do_not_depend_on_the_speed_unit():
     record = filled(10.0).record()
     slow = replace(record, velocity=record.velocity * 1e-6, count=None)
     assert find_missing_excitation(slow) == find_missing_excitation(record) == []
 
 
-def test_demands_are_met_without_a_speed():
+def test_excitation_requirements_are_met_without_a_speed():
     record = filled(10.0).record()
     for way in ({"count": None}, {"position": None, "hardware": Hardware()}):
         assert find_missing_excitation(replace(record, velocity=None, **way)) == []

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Rows that a log lost: their command is bridged, as a reader of bags does."""
+"""Commands are interpolated over rows that a log lost."""
 
 from dataclasses import replace
 
@@ -34,17 +34,17 @@ def ramps(lost: float, seed: int = 0) -> Record:
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_a_command_that_changes_all_the_time_goes_on_changing_in_rows_that_were_lost(seed):
+def test_varying_command_is_interpolated_over_lost_rows(seed):
     found = estimate(ramps(0.1, seed))
     lag = found.combinations["time_constant"]
-    # 5 standard deviations are a wrong number; held for all of a gap the command would have come
+    # 5 standard deviations count as a silent error; a command held over the gap would come
     # a tenth of a sample early on average, and as straight lines half a sample: 1 ms.
     assert abs(lag.value - LAG) < 5 * lag.std
     assert abs(lag.value - LAG) < 0.5e-3
     assert any(f.code == "samples_missing" for f in found.findings)
 
 
-def test_the_mean_of_a_straight_line_is_that_of_its_held_samples():
+def test_interpolated_voltage_is_the_mean_over_the_gap():
     t = np.delete(np.arange(60.0), [20, 30, 31])
     record = interpolate_lost_voltage(Record("motor", t, t.copy(), velocity=t))
     own = dict(zip(t, record.voltage, strict=True))
@@ -54,14 +54,14 @@ def test_the_mean_of_a_straight_line_is_that_of_its_held_samples():
 
 
 @pytest.mark.parametrize("begin", [40, 41, 60])
-def test_a_segment_at_another_rate_lost_nothing(begin):
-    """One of 2 s a row behind one of 1 s a row; the last of the first may be by itself."""
+def test_segment_at_another_rate_has_no_lost_rows(begin):
+    """Rows of 1 s, a row by itself, and rows of 2 s."""
     t = np.r_[np.arange(40.0), 50.0, 100.0 + 2 * np.arange(30)]
     record = Record("motor", t, t.copy(), velocity=t, starts=tuple(sorted({0, 40, 41, begin})))
     assert interpolate_lost_voltage(record) is record
 
 
-def test_complete_or_bridged_records_are_unchanged():
+def test_complete_or_already_interpolated_records_are_unchanged():
     whole = ramps(0.0)
     assert interpolate_lost_voltage(whole) is whole
     noted = replace(ramps(0.1), findings=(Finding("samples_missing", "note", "by the reader"),))

@@ -31,7 +31,7 @@ def test_a_speed_without_its_sign_is_refused_by_name(kind):
 
 
 def test_braking_pulses_in_one_direction_are_not_a_lost_sign():
-    """A speed that is never negative because the motor never turns back has its sign."""
+    """A speed may be non-negative because the motor never reverses."""
     rng = np.random.default_rng(1)
     runs = [(volts, n) for n in rng.integers(20, 60, 40) for volts, n in ((8.0, n), (-2.0, 8))]
     volts = np.concatenate([np.full(n, v) for v, n in runs])
@@ -57,14 +57,14 @@ def test_noise_at_rest_is_not_backward_motion(speed):
 
 
 @pytest.mark.parametrize("full", [100, 255, 1023])
-def test_a_duty_in_counts_that_is_called_a_voltage_is_questioned(full):
+def test_duty_cycle_counts_mapped_as_voltage_are_reported(full):
     record = driven()
     counts = np.rint(record.voltage / 10.0 * full)
     codes = [f.code for f in estimate(replace(record, voltage=counts)).findings]
     assert "whole_volts" in codes
 
 
-def test_a_voltage_in_whole_volts_is_not_questioned():
+def test_voltage_in_whole_volts_is_not_reported():
     record = driven()
     volts = [f.code for f in estimate(replace(record, voltage=np.rint(record.voltage))).findings]
     assert "whole_volts" not in volts
@@ -73,14 +73,14 @@ def test_a_voltage_in_whole_volts_is_not_questioned():
 @pytest.mark.parametrize(
     ("scale", "severity"), [(1.0, None), (20.3, "warning"), (300.7, "unreliable")]
 )
-def test_thousands_of_volts_are_questioned(scale, severity):
+def test_implausibly_high_voltage_is_reported(scale, severity):
     record = driven()
     found = estimate(replace(record, voltage=scale * record.voltage)).findings
     said = [f.severity for f in found if f.code == "high_voltage"]
     assert said == ([severity] if severity else [])
 
 
-def test_counts_without_their_number_a_turn_ask_for_it():
+def test_counts_without_counts_per_revolution_are_refused():
     record = driven()
     bare = replace(record, velocity=None, hardware=replace(record.hardware,
                                                            counts_per_revolution=None))  # fmt: skip

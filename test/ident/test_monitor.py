@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The monitor of a commissioned motor, on signals of a simulator of this file's own."""
+"""The monitor of a commissioned motor, on signals of an independent simulator."""
 
 import math
 from collections.abc import Iterator
@@ -21,7 +21,7 @@ STEP = 0.01
 
 @dataclass
 class Motor:
-    """Exact over steps of constant voltage and friction; what changes, changes between them."""
+    """A motor simulated exactly over steps; its parameters change between steps."""
 
     resistance: float = MOTOR.resistance
     constant: float = MOTOR.motor_constant
@@ -32,7 +32,7 @@ class Motor:
         self.change()
 
     def change(self) -> None:
-        """Compute the step anew."""
+        """Recompute the transition matrix."""
         r, k, c = self.resistance, self.constant, MOTOR
         b = self.friction * c.viscous_friction
         a = np.zeros((5, 5))
@@ -42,7 +42,7 @@ class Motor:
         self.rows = expm(a * STEP)[:3].tolist()
 
     def step(self, volts: float, load: float, held: bool) -> None:
-        """Advance; ``held`` is a wheel that something holds."""
+        """Advance by one step; ``held`` blocks the wheel."""
         i, w, angle = self.state
         if held:
             calm = math.exp(-self.resistance / MOTOR.inductance * STEP)
@@ -55,7 +55,7 @@ class Motor:
 
 
 def driving(seconds: float, rng: np.random.Generator) -> Iterator[float]:
-    """A command that a joystick would give: held for some seconds, reached in ramps."""
+    """Yield a joystick-like command: ramps to levels held for some seconds."""
     volts, target, left = 0.0, 0.0, 0.0
     for _ in range(round(seconds / STEP)):
         if left <= 0:
@@ -67,7 +67,7 @@ def driving(seconds: float, rng: np.random.Generator) -> Iterator[float]:
 
 
 def followed(seconds, change=lambda motor, time: False, bad_day=False, seed=1):
-    """Drive, and yield time and monitor every second."""
+    """Drive, and yield the time and the monitor every second."""
     rng = np.random.default_rng(seed)
     monitor, motor, count = Monitor(MOTOR), Motor(), 0
     held_until = lost_until = -1.0
@@ -103,7 +103,7 @@ def codes(monitor: Monitor) -> set[str]:
     return {f.code for f in monitor.findings()}
 
 
-def test_values_stay_and_are_not_known_until_the_motor_moves():
+def test_values_stay_commissioned_and_unestimated_at_rest():
     monitor = Monitor(MOTOR)
     for n in range(1000):
         monitor.add(n * STEP, 0.0, 0.001, 0.0)
@@ -112,7 +112,7 @@ def test_values_stay_and_are_not_known_until_the_motor_moves():
     assert not monitor.findings()
 
 
-def test_a_winding_that_heats_is_flagged_within_twenty_seconds_of_leaving_its_band():
+def test_heated_winding_is_reported_within_20_s_of_leaving_its_band():
     def heat(motor: Motor, time: float) -> bool:
         motor.resistance = MOTOR.resistance * (1 + 0.2 * min(max(time - 30, 0) / 60, 1))
         return 30 <= time <= 91
@@ -130,7 +130,7 @@ def test_a_winding_that_heats_is_flagged_within_twenty_seconds_of_leaving_its_ba
     assert hot.evidence["warmer"] == pytest.approx(51, abs=13)
 
 
-def test_a_magnet_that_weakens_is_separated_from_heat():
+def test_weakened_magnet_is_reported_without_a_heat_alarm():
     def weaken(motor: Motor, time: float) -> bool:
         motor.constant = MOTOR.motor_constant * (1 - 0.05 * min(max(time - 30, 0) / 60, 1))
         return 30 <= time <= 91
@@ -140,7 +140,7 @@ def test_a_magnet_that_weakens_is_separated_from_heat():
     assert codes(monitor) == {"magnet_weak"}
 
 
-def test_friction_that_triples_is_told_from_both():
+def test_tripled_friction_is_reported_without_heat_or_magnet_alarm():
     def drag(motor: Motor, time: float) -> bool:
         motor.friction = 3.0 if time >= 30 else 1.0
         return time == 30
@@ -150,13 +150,13 @@ def test_friction_that_triples_is_told_from_both():
     assert codes(monitor) == {"friction_high"}
 
 
-def test_half_an_hour_of_ordinary_driving_on_a_bad_day_raises_no_alarm():
+def test_half_an_hour_of_disturbed_driving_raises_no_alarm():
     for time, monitor in followed(1800.0, bad_day=True):
         assert not codes(monitor), time
     assert {state for state, _ in monitor.validity().values()} == {"estimated"}
 
 
-def test_signals_that_contradict_each_other_are_invalid_and_not_an_alarm():
+def test_inconsistent_signals_are_invalid_and_raise_no_alarm():
     rng = np.random.default_rng(0)
     monitor = Monitor(MOTOR)
     for n in range(6000):
@@ -172,7 +172,7 @@ def test_invalid_commissioned_values_are_refused_by_name():
         replace(MOTOR, inertia=0.0)
 
 
-def test_a_history_reads_back_but_for_a_line_that_was_cut(tmp_path):
+def test_history_is_read_without_its_truncated_last_line(tmp_path):
     *_, (_, monitor) = followed(60.0)
     file = tmp_path / "history.jsonl"
     entries = [history.entry_of(1e9 + 3600.0 * k, "front_left", monitor) for k in range(3)]
@@ -188,7 +188,7 @@ def test_a_history_reads_back_but_for_a_line_that_was_cut(tmp_path):
         history.read(file)
 
 
-def test_a_motor_without_a_measured_current_cannot_be_watched():
+def test_monitoring_without_a_measured_current_is_refused():
     found = Estimate(wheel="left", model="second_order", parameters={}, combinations={})
     with pytest.raises(ParameterError, match="current"):
         read_commissioned_values(found)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Records without any noise, as a simulator writes them, are a motor's like others."""
+"""Noise-free records, as from a simulator, are identified like noisy ones."""
 
 from functools import cache
 
@@ -43,7 +43,7 @@ def _record(kind: str, signal: str, current: bool) -> Record:
 @pytest.mark.parametrize("current", [True, False])
 @pytest.mark.parametrize("signal", ["counts", "speed", "angle"])
 @pytest.mark.parametrize("kind", ["square", "fourier"])
-def test_a_record_without_noise_is_answered_as_one_with_little(kind, signal, current):
+def test_noise_free_record_is_identified_without_bias(kind, signal, current):
     found = estimate(_record(kind, signal, current))
     assert found.model == ("electromechanical" if current else "second_order")
     assert not [f for f in found.findings if f.code in ("current_left_out", "torque_noise")]
@@ -58,7 +58,7 @@ def test_a_record_without_noise_is_answered_as_one_with_little(kind, signal, cur
 
 
 @pytest.mark.parametrize("per_turn", [28.0, 500.0])
-def test_an_angle_that_comes_in_steps_is_a_count(per_turn):
+def test_quantised_angle_is_treated_as_counts(per_turn):
     t = np.arange(4000) / 500.0
     v = excitation(t, "fourier", 9.0)
     out = simulate(t, v, R, L, K, J, B, TC, np.zeros(t.size), 100)
@@ -73,19 +73,19 @@ def test_an_angle_that_comes_in_steps_is_a_count(per_turn):
 
 
 @pytest.mark.parametrize("decimals", [6, 5])
-def test_a_log_of_seven_digits_leaves_the_steps_of_its_angle(decimals):
-    """Of 2000 counts before a gear of 50 the last digit is a sixth of one."""
+def test_angle_quantum_is_found_in_a_log_of_seven_digits(decimals):
+    """With 2000 counts and a gear of 50 the last digit is a sixth of a count."""
     rng = np.random.default_rng(3)
     step = 2 * np.pi / 2000 / 50
     t = np.arange(8000) / 500
     turned = np.cumsum(0.012 * (1 - np.cos(t)))
     logged = np.round(step * np.floor(turned / step), decimals)
     assert angle_quantum(logged) == pytest.approx(step, rel=1e-4)
-    # A sensor whose noise is a third of that has none.
+    # Noise of a third of a count hides the quantum.
     assert angle_quantum(turned + 0.3 * step * rng.standard_normal(t.size)) == 0.0
 
 
-def test_a_smooth_angle_has_no_steps():
+def test_smooth_angle_has_no_quantum():
     rng = np.random.default_rng(0)
     t = np.arange(5000) / 200
     for _ in range(50):

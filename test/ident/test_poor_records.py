@@ -35,9 +35,9 @@ def _record(voltage: np.ndarray, rate: float = 500.0, noise: float = 0.5) -> Rec
 
 
 @pytest.mark.parametrize("rest", [0, 200])
-def test_a_single_level_of_voltage_gives_one_combination(rest):
+def test_one_voltage_level_identifies_only_the_steady_speed(rest):
     record = _record(np.r_[np.zeros(rest), np.full(600, 8.0)])
-    if rest == 0:  # the first row is the step: the motor stood before it
+    if rest == 0:  # the first row is the step from rest
         assert np.ptp(record.voltage) == 0.0
     found = estimate(record)
     for name in ("dc_gain", "static_voltage"):
@@ -53,7 +53,7 @@ def test_a_single_level_of_voltage_gives_one_combination(rest):
     assert compute_fit_percent(measured, simulated) > 90
 
 
-def test_friction_that_delays_the_first_motion_is_in_the_lags_of_one_step():
+def test_lag_uncertainty_covers_the_breakaway_delay_of_one_step():
     # From rest the winding first builds up the torque that friction holds: 0.6 V of 8 V are a
     # delay of 1.5 ms, which another winding and no friction explain as well.
     step = np.r_[np.zeros(100), np.full(900, 8.0)]
@@ -64,16 +64,16 @@ def test_friction_that_delays_the_first_motion_is_in_the_lags_of_one_step():
     motors.check(estimate(record), motors.truth("rear_left", 0.6), lags, total=True, most=0.5)
 
 
-def test_two_levels_know_gain_and_friction_apart():
+def test_two_voltage_levels_separate_gain_and_friction():
     found = estimate(_record(np.r_[np.zeros(100), np.full(400, 8.0), np.full(400, 4.0)]))
     motors.check(found, TRUTH, ("dc_gain", "static_voltage"))
     assert "steady_speed" not in found.combinations
-    # One way only: a load as large as half of the friction would have been friction, too.
+    # In one direction a load is confounded with friction.
     assert "one_direction" in [f.code for f in found.findings if f.severity == "warning"]
 
 
-def test_a_motor_that_its_load_would_drive_one_way_is_unreliable():
-    """It follows the voltage less than its steady speed asks for: 8 rad/s/V of 15, here."""
+def test_incremental_gain_below_static_gain_is_reported_as_load_or_driver_effect():
+    """The incremental gain of 8 rad/s/V is below the static gain of 15 rad/s/V."""
     level = 4.0 + np.where(np.arange(2000) // 100 % 2, 0.5, -0.5)
     t = np.arange(level.size) / 500.0
     changes = lfilter([1 - np.exp(-1 / 60)], [1, -np.exp(-1 / 60)], level - 4.0)
@@ -98,8 +98,8 @@ def test_an_impossible_motor_is_reported():
     "speed, volts, code",
     [(1.0, 1.0, None), (60 / (2 * np.pi), 1.0, "fast_motor"), (1.0, 0.05, "implausible_motor")],
 )
-def test_a_speed_in_rpm_or_a_command_in_amperes_makes_a_motor_that_hardly_is(speed, volts, code):
-    """Of 6,300 rpm at 24 V; its driver's command is a twentieth of the volts that it takes."""
+def test_speed_in_rpm_or_command_in_amperes_is_reported_as_implausible(speed, volts, code):
+    """The motor turns 6,300 rpm at 24 V; a command in A is a twentieth of the voltage in V."""
     good = motors.record("rear_left", current=False, seconds=3.0)
     turned = speed * good.count * motors.QUANTUM
     hardware = replace(good.hardware, supply_voltage=24.0)
@@ -108,7 +108,7 @@ def test_a_speed_in_rpm_or_a_command_in_amperes_makes_a_motor_that_hardly_is(spe
     assert codes & {"fast_motor", "implausible_motor"} == ({code} if code else set())
 
 
-def test_rest_before_the_excitation_changes_nothing():
+def test_rest_before_the_excitation_does_not_change_the_estimate():
     driven = motors.record("rear_left", current=False, seconds=3.0)
     n = 4000
     t = np.arange(n + len(driven)) / 200.0
@@ -122,7 +122,7 @@ def test_rest_before_the_excitation_changes_nothing():
         assert abs(a.value - b.value) < b.std, name
 
 
-def test_the_scatter_of_an_angle_at_rest_is_not_motion():
+def test_angle_noise_at_rest_is_not_detected_as_motion():
     driven = motors.record("rear_left", current=False, seconds=3.0)
     n, rng = 9000, np.random.default_rng(3)
     turn = 2 * np.pi / driven.hardware.counts_per_revolution
@@ -148,7 +148,7 @@ def staircase(lag: float, scatter: float) -> Record:
     return Record("motor", np.arange(voltage.size) * 1.0, voltage, velocity=noisy)
 
 
-def test_a_lag_below_the_sampling_interval_leaves_a_gain():
+def test_gain_is_estimated_if_the_lag_is_below_the_sampling_interval():
     found = estimate(staircase(0.05, 5.0))
     lag, gain = (found.combinations[n] for n in ("time_constant", "dc_gain"))
     assert abs(lag.value - 0.05) < 2 * lag.total_std and lag.total_std > 0.05
@@ -156,7 +156,7 @@ def test_a_lag_below_the_sampling_interval_leaves_a_gain():
     assert estimate(staircase(1.0, 5.0)).combinations["time_constant"].value is not None
 
 
-def test_an_angle_that_is_given_as_a_speed_is_recognised():
+def test_angle_mapped_as_velocity_is_refused_with_advice():
     rng = np.random.default_rng(11)
     rate, turns = 50.0, np.array([0.6, 0.0, -0.7, 0.0, 0.5, -0.6])
     voltage = 2.5 * np.repeat(turns, 60) + 0.2 * np.repeat(rng.standard_normal(72), 5)
@@ -168,7 +168,7 @@ def test_an_angle_that_is_given_as_a_speed_is_recognised():
         estimate(Record("motor", t, voltage, velocity=noisy))
 
 
-def test_the_rounding_of_counts_hides_no_step():
+def test_time_constant_is_estimated_from_one_step_of_coarse_counts():
     # 64 counts a turn at 5 kHz: between two samples there is a count or none.
     t = np.arange(15000) / 5000.0
     gain, tau, net = 17.5, 0.015, 6.6
@@ -183,7 +183,7 @@ def test_the_rounding_of_counts_hides_no_step():
     assert not found.unreliable
 
 
-def test_a_load_does_not_hide_the_order():
+def test_constant_load_does_not_bias_gain_and_friction():
     # A square of 3.7 V, load of half the friction and a delay of a seventh of a sample: first
     # order with both, solved exactly between the changes of voltage and of direction.
     gain, tau, friction, load, rate = 67.0, 0.023, 0.14, 0.08, 200.0
@@ -205,7 +205,7 @@ def test_a_load_does_not_hide_the_order():
 
 
 @pytest.mark.parametrize(("second_tone", "said"), [(0.0, True), (2.0, False)])
-def test_a_sine_reports_that_a_voltage_drop_would_not_show(second_tone, said):
+def test_single_sine_is_reported_as_one_voltage_amplitude(second_tone, said):
     rate = 200.0
     t = np.arange(2000) / rate
     voltage = 6.0 * np.sin(2 * np.pi * 1.1 * t) + second_tone * np.sin(2 * np.pi * 3.7 * t)
@@ -216,7 +216,7 @@ def test_a_sine_reports_that_a_voltage_drop_would_not_show(second_tone, said):
     assert ("one_size_of_voltage" in [f.code for f in found.findings]) is said
 
 
-def test_an_offset_of_the_current_may_be_a_drop_of_the_driver_where_the_motor_turns_one_way():
+def test_friction_uncertainty_covers_a_driver_voltage_drop_in_one_direction():
     r, el, k, j, b, tc, drop = 3.4, 1.5e-3, 0.026, 2.3e-5, 4e-5, 7e-4, 0.06
     rng = np.random.default_rng(3)
     t = np.arange(4000) / 500
@@ -230,8 +230,8 @@ def test_an_offset_of_the_current_may_be_a_drop_of_the_driver_where_the_motor_tu
 
 
 @pytest.mark.parametrize("sharp", [False, True])
-def test_a_ramp_that_overcomes_friction_late_is_not_a_delay(sharp):
-    """Rest holds by 1.5 V, motion by 0.5 V: late by 0.3 s of a ramp; a step's delay is one."""
+def test_stiction_under_a_ramp_is_not_estimated_as_delay(sharp):
+    """Breakaway at 1.5 V, friction of 0.5 V: a ramp starts 0.3 s late. A step has a true delay."""
     rng = np.random.default_rng(0)
     t = np.arange(4000) / 1000
     volts = 3.2 * t if not sharp else np.where(t % 1.0 > 0.5, 9.0, 0.0)
@@ -257,7 +257,7 @@ CHIRP = 10.0 * np.sin(2 * np.pi * (0.3 * TIME + 6.0 * TIME**2))  # to 72 Hz: a s
 
 
 def weaker(volts: np.ndarray, share: float, rate: float) -> Record:
-    """Return counts of a motor that in the last three tenths gets this share of its voltage."""
+    """Return counts of a motor whose voltage is scaled by ``share`` in the last 30 %."""
     late = np.arange(volts.size) >= 0.7 * volts.size
     given = np.where(late, share * volts, volts)
     made = motors.record("rear_left", current=False, voltage=given, rate=rate)
@@ -265,8 +265,8 @@ def weaker(volts: np.ndarray, share: float, rate: float) -> Record:
 
 
 @pytest.mark.parametrize("share", [1.0, 0.7])
-def test_held_out_data_are_judged_by_what_their_sensor_can_show(share):
-    if share == 1.0:  # a tail of a few counts is followed to a count: nothing speaks against it
+def test_validation_accounts_for_the_sensor_resolution(share):
+    if share == 1.0:  # a tail of a few counts is predicted to a count
         found = estimate(weaker(CHIRP, 1.0, RATE))
     else:
         volts = motors.independent.excitation(np.arange(2000) / 200.0, "square", 10.0)
@@ -283,11 +283,11 @@ def counted(counts: list[int], starts: tuple[int, ...] = (0,)) -> Record:
 
 
 def kept(record: Record) -> list[int]:
-    """Indices at which the angle is an output."""
+    """Return the indices at which the angle is an output."""
     return [int(k) for k in np.flatnonzero(np.isfinite(prepare([record], False).motion))]
 
 
-def test_the_middle_sample_of_a_standstill_is_kept():
+def test_only_the_middle_sample_of_a_standstill_is_kept():
     moving, still = list(range(20)), [20] * 31
     assert kept(counted([*moving, *still, *range(21, 30)])) == [*range(20), 35, *range(51, 60)]
 
@@ -297,13 +297,13 @@ def test_a_segment_that_begins_at_rest_keeps_its_first_sample():
     assert kept(counted(counts, (0, 40))) == [0, *range(30, 40), 40, *range(70, 74)]
 
 
-def test_slow_motion_is_unchanged():
+def test_slow_motion_keeps_all_samples():
     slow = [k // (MIN_REST_SAMPLES - 1) for k in range(90)]
     assert kept(counted(slow)) == list(range(90))
 
 
 @pytest.mark.parametrize("rest", [MIN_REST_SAMPLES, 10 * MIN_REST_SAMPLES])
-def test_how_long_it_stands_adds_nothing(rest):
+def test_duration_of_a_standstill_does_not_add_samples(rest):
     assert len(kept(counted([0, 1, 2, *[3] * rest, 4, 5]))) == 6
 
 

@@ -47,7 +47,7 @@ def test_prbs_of_one_day_explains_the_other_day(fitted, kept):
     assert result.value("averaging_window") == pytest.approx(0.020, abs=0.002)
 
 
-def test_five_days_scatter_no_more_than_the_intervals_of_each():
+def test_scatter_over_five_days_is_within_the_stated_uncertainty():
     estimates = [estimate_day(*days) for days in (*EACH_OTHER, *OTHERS)]
     found = [one.combinations for one in estimates]
     for name in ("dc_gain", "time_constant", "static_voltage"):
@@ -59,7 +59,7 @@ def test_five_days_scatter_no_more_than_the_intervals_of_each():
         assert np.sum(np.square((value - mean) / std)) / 4 < 1.5**2, name
 
 
-def test_five_steps_in_one_fit_tell_the_speed_filter_from_a_delay():
+def test_joint_fit_of_five_steps_separates_speed_averaging_from_delay():
     result = estimate([step(p) for p in sorted((DATA / "step_gearmotor").glob("*.csv"))[::2]])
     assert result.fit_percent.estimation > 93
     assert result.fit_percent.validation > 93
@@ -69,7 +69,7 @@ def test_five_steps_in_one_fit_tell_the_speed_filter_from_a_delay():
     assert any(f.code == "averaged_speed" for f in result.findings)
 
 
-def test_ten_steps_in_one_fit_tell_the_friction_that_their_steady_speeds_do():
+def test_friction_from_ten_steps_agrees_with_their_steady_speeds():
     result = estimate([step(p) for p in sorted((DATA / "step_gearmotor").glob("*.csv"))])
     lag = result.combinations["time_constant"]
     assert abs(lag.value - 0.0265) < 2 * lag.total_std

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A Record refuses what cannot be one motor's signals, and names it."""
+"""A Record refuses inconsistent signals by name."""
 
 import numpy as np
 import pytest
@@ -56,7 +56,7 @@ def test_an_infinite_measurement_counts_as_missing(name):
     assert np.isinf(measured[2])  # the caller's array is as it was
 
 
-def test_a_slice_is_a_record_with_its_own_zero_and_inner_segments():
+def test_slice_starts_at_time_zero_and_keeps_inner_segments():
     part = a_record(starts=(0, 2, 4), count=np.arange(6)).slice(1, 5)
     assert part.starts == (0, 1, 3)
     assert part.time[0] == 0

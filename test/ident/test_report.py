@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The report: a page that stands alone, drawings and words of the same numbers."""
+"""The report: a self-contained page with charts and text of the same numbers."""
 
 import json
 import math
@@ -25,7 +25,7 @@ from smp_motor_ident.tune.curves import Curves
 
 
 class Outside(HTMLParser):
-    """Collects every address that a page would load, and its identifiers."""
+    """Collect the external addresses and the identifiers of a page."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -48,7 +48,7 @@ def page() -> str:
     return render(Report(wheels, {"front_left": parts}, failures, {"Command": "identify a b"}))
 
 
-def test_page_loads_nothing_from_elsewhere_and_its_identifiers_are_unique(page):
+def test_page_has_no_external_resources_and_unique_identifiers(page):
     outside = Outside()
     outside.feed(page)
     assert outside.addresses == []
@@ -57,13 +57,13 @@ def test_page_loads_nothing_from_elsewhere_and_its_identifiers_are_unique(page):
     assert len(outside.identifiers) == len(set(outside.identifiers))
 
 
-def test_names_of_users_are_escaped(page):
+def test_user_supplied_names_are_escaped(page):
     assert "<script>alert" not in page
     assert "&lt;script&gt;" in page
     assert "<b>missed</b>" not in page
 
 
-def test_page_tells_failures_warnings_and_unidentifiable_parameters(page):
+def test_page_states_failures_warnings_and_unidentifiable_parameters(page):
     assert "Voltage is constant; excite the motor." in page
     assert "look alike at 100 Hz" in page
     assert all(
@@ -74,11 +74,11 @@ def test_page_tells_failures_warnings_and_unidentifiable_parameters(page):
 @pytest.mark.parametrize(
     "named", [["time_constant"], ["dc_gain"], ["dc_gain", "time_constant"], []]
 )
-def test_a_finding_marks_its_quantities_unreliable_or_else_all(named):
+def test_unreliable_finding_marks_its_quantities_or_all_if_none_are_named(named):
     known = estimate(current=False)  # gain and time constant
     grave = Finding("code", "unreliable", "the data are poor", quantities=tuple(named))
     doubted = find_doubted(replace(known, findings=(*known.findings, grave)))
-    # The gravest is told first.
+    # The most severe finding comes first.
     assert doubted == dict.fromkeys(named or ["dc_gain", "time_constant"], 1)
 
 
@@ -95,7 +95,7 @@ def test_a_finding_marks_its_quantities_unreliable_or_else_all(named):
         (Quantity(0.31, 0.0996, (0.11, 0.5), "1"), "0.31 ± 0.10", "0.11 … 0.50"),
     ],
 )
-def test_a_number_has_the_digits_that_its_deviation_allows(quantity, number, between):
+def test_value_is_rounded_by_its_standard_deviation(quantity, number, between):
     assert words.state(quantity) == number
     assert words.interval(quantity) == between
 
@@ -105,7 +105,7 @@ def test_a_number_has_the_digits_that_its_deviation_allows(quantity, number, bet
     [(28.0, 1.874, "± 190 % (delay)"), (0.04, 0.0031, "± 0.31 % (delay)"),
      (150.0, None, "± 150 V (delay)")],
 )  # fmt: skip
-def test_systematic_errors_are_told_with_two_digits_and_no_exponent(size, share, told):
+def test_systematic_errors_are_stated_with_two_digits_and_no_exponent(size, share, told):
     quantity = Quantity(14.9, 3.5, unit="V", systematic=(Share("delay", share, size),))
     assert words.systematic(quantity) == told
 
@@ -119,7 +119,7 @@ def test_every_colour_of_the_charts_is_a_variable_of_the_page(page):
     assert used <= defined
 
 
-def test_each_chart_has_a_drawing_for_print_and_words_for_those_who_cannot_see_it(page):
+def test_each_chart_has_a_static_drawing_with_an_accessible_label(page):
     charts = json.loads(re.findall(r'id="charts">(.*?)</script>', page, re.DOTALL)[0])
     assert {chart["name"].split("-")[0] for chart in charts} >= {
         "speed", "residual", "voltage", "autocorrelation", "correlation", "gain", "phase",
@@ -130,7 +130,7 @@ def test_each_chart_has_a_drawing_for_print_and_words_for_those_who_cannot_see_i
 
 
 @pytest.mark.skipif(not CHROMIUM, reason="no Chromium on this machine")
-def test_a_browser_draws_every_chart_zooms_and_asks_nobody(page, tmp_path):
+def test_browser_draws_and_zooms_every_chart_without_network_requests(page, tmp_path):
     file = tmp_path / "report.html"
     file.write_text(page)
     with Browser(tmp_path / "profile") as browser:
@@ -157,7 +157,7 @@ def test_a_browser_draws_every_chart_zooms_and_asks_nobody(page, tmp_path):
         assert set(browser.requests) == {file.as_uri()}
 
 
-def test_sliders_of_the_tuning_page_choose_designs_that_tune_has_made(tmp_path, monkeypatch):
+def test_tuning_sliders_select_precomputed_designs(tmp_path, monkeypatch):
     tuning = tuning_of_two(monkeypatch, estimate())
     soft, own = tuning.choices
     assert tuning.chosen == 1
@@ -190,7 +190,7 @@ def test_sliders_of_the_tuning_page_choose_designs_that_tune_has_made(tmp_path, 
         assert set(browser.requests) == {file.as_uri()}
 
 
-def test_the_chart_of_the_residuals_shows_what_the_test_has_judged():
+def test_residual_charts_show_the_values_of_the_residual_tests():
     tests = ResidualTests(False, True, correlation(0.5, 0.01), correlation(0.02, 0.01))
     own, cross = residual_charts("w", tests)
     assert own.lines == cross.lines == (-0.1, 0.0, 0.1)
@@ -209,7 +209,7 @@ def test_the_autocorrelation_at_lag_zero_is_not_drawn_as_outside():
     assert cross.x.tolist() == [0.0, 1.0, 2.0]
 
 
-def test_the_model_is_told_by_the_components_of_its_chain_in_words():
+def test_page_describes_the_model_by_its_chain_components():
     chain = ChainRecord(("friction", "dead_zone", "angle", "first_order"))
     known = replace(estimate(current=False), model="first_order", chain=chain)
     text = render(Report({known.wheel: known}))
@@ -221,7 +221,7 @@ def test_the_model_is_told_by_the_components_of_its_chain_in_words():
     assert "Components of the chain" not in bare
 
 
-def test_names_in_backticks_are_set_as_code_and_nothing_else_is_trusted():
+def test_backticks_become_code_and_other_markup_is_escaped():
     said = Finding("scale", "warning", "see `gap` <b>", advice="state `current_accuracy`")
     known = replace(estimate(), findings=(said,))
     text = render(Report({known.wheel: known}))
@@ -229,7 +229,7 @@ def test_names_in_backticks_are_set_as_code_and_nothing_else_is_trusted():
     assert "State <code>current_accuracy</code>." in text
 
 
-def test_frequency_response_of_data_is_that_of_the_system_they_come_from():
+def test_frequency_response_from_data_matches_the_true_system():
     # A first-order lag sampled exactly, under noise: gain k/|1 + j w tau| of the held input.
     k, tau, step, n = 25.0, 0.1, 0.005, 16_384
     rng = np.random.default_rng(11)
@@ -245,7 +245,7 @@ def test_frequency_response_of_data_is_that_of_the_system_they_come_from():
     np.testing.assert_allclose(gain.curves[0].y[low], truth[low], rtol=0.01)
 
 
-def test_frequency_response_costs_nothing_for_a_pause_of_years():
+def test_frequency_response_ignores_a_pause_of_years():
     whole = comparison("estimation")
     later = np.arange(whole.time.size) >= 2000
     part = replace(whole, time=whole.time + 1.7e9 * later)  # 340 billion intervals
@@ -255,7 +255,7 @@ def test_frequency_response_costs_nothing_for_a_pause_of_years():
 
 
 @pytest.mark.parametrize(("low", "high"), [(0.0, 46.0), (-3.2, 3.2), (1e-7, 2e-7)])
-def test_ticks_are_round_and_inside(low, high):
+def test_axis_ticks_lie_within_the_range(low, high):
     found = ticks(low, high)
     assert 3 <= len(found) <= 12
     assert low <= found[0] < found[-1] <= high

@@ -23,7 +23,7 @@ SHARES = (("current_scale", 0.03), ("smoothed_current", 0.0043), ("low_passed_cu
 
 
 def poor(wheel: str) -> Estimate:
-    """Return a result with all that a card may hold: many messages, doubts, a range, shares."""
+    """Return a result that fills a card: many findings, a range, systematic errors."""
     known = estimate(wheel)
     told = dict(known.combinations)
     told["time_constant"] = Quantity(None, ci95=(0.0, 0.0525), unit="s", status="unidentifiable")
@@ -75,7 +75,7 @@ def tops(browser: Browser, *selectors: str) -> list[float]:
 
 @pytest.mark.parametrize(("width", "highest"), [(1280, 5000), (720, 12_000), (390, 12_000)])
 @pytest.mark.parametrize("dark", [False, True])
-def test_four_poor_wheels_fit_a_short_page(browser, file, width, highest, dark):
+def test_report_of_four_wheels_with_many_findings_stays_short(browser, file, width, highest, dark):
     browser.open(file, width, dark=dark)
     # A phone of 390 px shows a third of 1280 px, so the limit of 5,000 is scaled.
     assert browser.value("document.documentElement.scrollHeight") <= highest
@@ -89,7 +89,7 @@ def test_four_poor_wheels_fit_a_short_page(browser, file, width, highest, dark):
     assert browser.complaints == []
 
 
-def test_a_motor_is_told_in_the_order_of_its_readers_questions(browser, file):
+def test_wheel_card_shows_values_chart_gains_and_findings_in_order(browser, file):
     browser.open(file, 390)
     order = tops(
         browser, "h1", "#side-by-side", "#front_left h2", "#front_left .values",
@@ -119,7 +119,7 @@ def test_the_card_names_unreliable_values_and_systematic_errors(browser, file):
     browser.open(file, 1280)
     verdict = browser.value("document.querySelector('#front_left .verdict').textContent")
     assert verdict == "Unreliable: time constant"
-    # A number that is not known has its range; one that is, the digits that its ± allows.
+    # An unknown value has its range; a known one is rounded by its standard deviation.
     assert row(browser, "Time constant") == [
         "Time constant τ", "0 … 52.5 ms", "not identifiableunreliable, see 1",
     ]  # fmt: skip
@@ -133,7 +133,7 @@ def test_the_card_names_unreliable_values_and_systematic_errors(browser, file):
     assert "tune 'my results' --output gains.yaml --accept-unreliable" in gains
 
 
-def test_intervals_side_by_side_are_seen_on_an_axis(browser, file):
+def test_intervals_of_all_wheels_are_drawn_on_a_common_axis(browser, file):
     browser.open(file, 1280)
     compared: list[dict[str, Any]] = browser.value(
         "[...document.querySelectorAll('.compared')].map(f => ({name: f.querySelector('h3')"
@@ -142,7 +142,7 @@ def test_intervals_side_by_side_are_seen_on_an_axis(browser, file):
         ".width)}))"
     )
     named = {one["name"]: one for one in compared}
-    # Of a quantity that no wheel has, only a range, nothing is compared.
+    # A quantity known only as a range is not compared.
     assert "Time constant" not in named
     for one in compared:
         assert len(one["ticks"]) >= 2

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A current that a driver regulates rests at its command; a clipped sensor rests at its limit."""
+"""A regulated current stays at its command; a clipped one stays at the sensor's limit."""
 
 import motors
 import numpy as np
@@ -36,7 +36,7 @@ def regulated() -> Record:
                   hardware=motors.record(seconds=1.0).hardware)  # fmt: skip
 
 
-def test_a_regulated_current_is_not_clipped():
+def test_regulated_current_is_not_refused_as_clipped():
     record = regulated()
     assert (record.current == record.current.max()).mean() > 0.1
     found = estimate(record)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A reversed answer is separated from a late one; where nothing separates them, it says so."""
+"""A reversed response is separated from a delayed one, or reported as ambiguous."""
 
 from dataclasses import replace
 
@@ -16,7 +16,7 @@ N = len(GOOD)
 
 
 def sine(samples, rate=100.0, seconds=10.0):
-    """Return a record of a sine of so many samples a period, from counts."""
+    """Return counts under a sine with the given number of samples per period."""
     volts = 10.0 * np.sin(2 * np.pi * np.arange(int(rate * seconds)) / samples + 0.1)
     return motors.record("rear_left", voltage=volts, rate=rate)
 
@@ -36,11 +36,11 @@ def late(record, samples):
     return replace(record, count=record.count[k], velocity=record.velocity[k])
 
 
-SLOW = {"steps": steps, "a slow sine": lambda: sine(150.0), "a sine of 25": lambda: sine(25.0)}
+SLOW = {"steps": steps, "slow sine": lambda: sine(150.0), "fast sine": lambda: sine(25.0)}
 
 
 @pytest.mark.parametrize("name", SLOW)
-def test_swapped_leads_are_found_and_right_ones_left_alone(name):
+def test_swapped_leads_are_refused_and_correct_ones_accepted(name):
     for delay in (0, 1, 2):
         record = late(SLOW[name](), delay)
         _check_signs([record], "record")
@@ -48,7 +48,7 @@ def test_swapped_leads_are_found_and_right_ones_left_alone(name):
             _check_signs([swapped(record)], "record")
 
 
-def test_a_current_of_the_wrong_sign_is_found_and_the_right_one_left_alone():
+def test_swapped_current_sign_is_refused_and_the_correct_one_accepted():
     for name, make in SLOW.items():
         record = make()
         _check_signs([record], name)
@@ -56,7 +56,7 @@ def test_a_current_of_the_wrong_sign_is_found_and_the_right_one_left_alone():
             _check_signs([replace(record, current=-record.current)], name)
 
 
-def test_a_current_between_rows_that_were_left_out_shows_no_sign():
+def test_sign_of_a_lagging_current_is_not_judged_in_a_decimated_record():
     """The command switches every eight rows and every fifth row is kept, so the current lags."""
     bits = np.random.default_rng(1).choice([-10.0, 10.0], 375)
     whole = motors.record("rear_left", voltage=np.repeat(bits, 8), rate=200.0)
@@ -70,7 +70,7 @@ def test_a_current_between_rows_that_were_left_out_shows_no_sign():
 @pytest.mark.parametrize("sign", [1, -1])
 @pytest.mark.parametrize("samples", [2.9, 3.0, 3.1])
 def test_three_samples_per_period_do_not_determine_the_sign(samples, sign):
-    """Lag, sampling and a driver's clock may come to any phase there: no wrong cause is named."""
+    """Lag, sampling and the driver's clock may add up to any phase: no cause is named."""
     record = sine(samples) if sign > 0 else swapped(sine(samples))
     found = correlate_with_voltage([record], [record.velocity], lags=True)
     # Half a sample is 60 degrees: the nearest delay misses the phase by 30 at most.
@@ -92,7 +92,7 @@ def test_a_motor_at_rest_has_no_swapped_sign():
         _check_signs([swapped(GOOD)], "record")
 
 
-def test_a_reversed_motor_among_gaps_and_of_a_noisy_sensor_is_found():
+def test_swapped_sign_is_found_despite_gaps_and_sensor_noise():
     rng = np.random.default_rng(2)
     speed = -GOOD.velocity + 200.0 * rng.standard_normal(N)
     speed[rng.random(N) < 0.2] = np.nan

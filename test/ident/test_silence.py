@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A sensor that falls silent is dead where the voltage would have moved it, and only there."""
+"""A silent sensor is dead only if the voltage would have moved it."""
 
 from dataclasses import replace
 
@@ -26,7 +26,7 @@ def coarse(signal, volts=CHIRP, rate=RATE):
 
 
 def cut(record, signal, share):
-    """Return a record whose sensor's cable comes off."""
+    """Return a record whose sensor is disconnected after ``share`` of the rows."""
     row = np.arange(len(record))
     off = row > share * len(record)
     values = getattr(record, signal)
@@ -35,16 +35,16 @@ def cut(record, signal, share):
 
 
 @pytest.mark.parametrize("signal", ["count", "position", "velocity"])
-def test_a_chirp_that_outruns_the_motor_leaves_its_encoder_alive(signal):
+def test_silence_in_a_chirp_beyond_the_bandwidth_is_not_a_dead_encoder(signal):
     alive = coarse(signal)
     values = getattr(alive, signal)
-    assert np.ptp(values[int(0.85 * len(values)) :]) == 0.0  # a silence in which the motor swings
+    assert np.ptp(values[int(0.85 * len(values)) :]) == 0.0  # silent although the motor swings
     refuse_silent_sensor(alive, "record")
 
 
 @pytest.mark.parametrize("signal", ["count", "position", "velocity"])
 @pytest.mark.parametrize("kind", ["chirp", "sine", "square", "fourier"])
-def test_an_encoder_whose_cable_comes_off_is_dead(signal, kind):
+def test_disconnected_encoder_is_refused_as_dead(signal, kind):
     if kind == "chirp":
         whole, shares = coarse(signal), [0.1]
     else:
@@ -57,8 +57,8 @@ def test_an_encoder_whose_cable_comes_off_is_dead(signal, kind):
 
 
 @pytest.mark.parametrize("signal", ["count", "velocity"])
-def test_a_speed_below_the_step_of_its_sensor_is_not_a_dead_sensor(signal):
-    """A speed in whole steps of 60 rad/s, or the counts of the same motor, in ever faster turns."""
+def test_speed_below_the_sensor_resolution_is_not_a_dead_sensor(signal):
+    """A speed quantised to 60 rad/s, or counts of the same motor, under a chirp."""
     record = coarse(signal)
     speed = np.gradient(motors.record("rear_left", voltage=CHIRP, rate=RATE).count * 0.01257, TIME)
     if signal == "velocity":
@@ -88,8 +88,8 @@ def test_a_standstill_at_the_end_of_a_run_does_not_affect_the_next():
 
 
 @pytest.mark.parametrize("span", [(800, 1200), (500, 1400)])
-def test_a_motor_that_is_blocked_for_a_while_is_estimated_from_the_rest(span):
-    """A fifth of the record, and nearly half of it: it had been refused as a dead encoder."""
+def test_temporarily_blocked_motor_is_estimated_from_the_other_samples(span):
+    """Blocked for a fifth and for nearly half of the record."""
     volts = motors.independent.excitation(np.arange(2000) / 200.0, "fourier", 10.0)
     whole = motors.record("rear_left", current=False, voltage=volts, rate=200.0)
     whole = replace(whole, velocity=None)

@@ -13,8 +13,8 @@ from smp_motor_ident.quality.lag import apply_lag
 from smp_motor_ident.record import Record
 
 
-def test_a_gain_at_its_upper_bound_is_not_stated():
-    """A step from rest tells the gain times what friction leaves of the voltage, and no more."""
+def test_gain_from_one_step_is_unidentifiable_or_within_its_uncertainty():
+    """A step from rest identifies only the gain times the voltage above friction."""
     gain, tau, friction = 11.45, 0.1967, 0.294
     t = np.arange(60) / 20.0
     voltage = np.where(t > 0.5, 4.8, 0.0)
@@ -30,7 +30,7 @@ def test_a_gain_at_its_upper_bound_is_not_stated():
 
 
 def _step(rows: int, seed: int) -> Record:
-    """Return 1.5 s at 8 V, from rest to a steady speed, and so many rows without voltage."""
+    """Return 1.5 s at 8 V, from rest to a steady speed, and ``rows`` rows of coasting."""
     gain, tau, friction = 15.0, 0.12, 2.0
     t = np.arange(60 + rows) / 40.0
     up = gain * (8.0 - friction) * (1 - np.exp(-t / tau))
@@ -46,8 +46,8 @@ def test_one_coast_separates_gain_and_friction_in_steps_to_one_level():
     motors.check(found, {"dc_gain": 15.0, "static_voltage": 2.0}, most=0.25)
 
 
-def test_steps_of_one_size_say_that_a_ramp_of_the_driver_would_not_show():
-    """A ramp that is as long at every step is a mean over that time, as a sensor's may be."""
+def test_steps_of_one_size_are_reported_as_hiding_a_driver_ramp():
+    """A driver ramp of constant duration is confounded with averaging by the sensor."""
     rng, tau = np.random.default_rng(4), 0.02
     for sizes, said in (((2.0,), True), ((1.0, 2.0, 4.0), False)):
         steps = rng.choice(sizes, 24) * np.r_[np.ones(12), -np.ones(12)]
@@ -77,7 +77,7 @@ def logged_step(volts: float) -> Record:
 
 
 @pytest.mark.parametrize("volts", [8.1, -8.1])
-def test_a_step_and_its_mirror_image_tell_the_same_motor(volts):
+def test_mirrored_step_gives_the_same_estimate(volts):
     record = logged_step(volts)
     mirror = replace(record, voltage=-record.voltage, velocity=-record.velocity)
     one, other = estimate(record), estimate(mirror)
@@ -94,7 +94,7 @@ def test_a_step_and_its_mirror_image_tell_the_same_motor(volts):
 
 
 @pytest.mark.parametrize("sign", [1, -1])
-def test_steps_that_a_log_rounds_unevenly_are_steps(sign):
+def test_speed_quantum_is_found_despite_uneven_rounding_of_the_log(sign):
     speed = logged_step(sign * 8.1).velocity
     # A line through 36 levels, each out by half a unit, is out by far less than a unit.
     assert speed_quantum(speed) == pytest.approx(31.25 * UNIT, rel=0.005)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The claim of benchmarks/together.py in small: four unlike wheels arrive together."""
+"""Short version of benchmarks/together.py: four different wheels settle together."""
 
 from pathlib import Path
 
@@ -27,5 +27,5 @@ def test_four_motors_under_uneven_load_settle_together_without_overshoot(found, 
     # The issue's bounds: one control period, 5 ms at 1 kHz; overshoot below 1 %.
     assert arrival.spread <= most
     assert max(arrival.overshoot.values()) < 1.0
-    # And it is the reference that does it: the same loops on the bare step are far apart.
+    # The common reference causes it: under a plain step the same loops are far apart.
     assert plain.spread > 3.0 * arrival.spread

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Gains for a speed that is made of an angle with noise of its own, with counts and without."""
+"""Gains for a speed differenced from a noisy angle, with and without counts."""
 
 import json
 import math
@@ -72,8 +72,8 @@ def held(one, noise: float, steps: int = 8000):
     return volts[steps // 4 :], speeds[steps // 4 :]
 
 
-def test_noise_of_an_angle_limits_the_gains(found):
-    """Differenced over a sample, 3 mrad are 8.5 rad/s rms: deaf gains fill the clamp."""
+def test_angle_noise_limits_the_gains(found):
+    """Differenced over a sample, 3 mrad are 8.5 rad/s rms: gains that ignore it saturate."""
     # 8000 samples tell a standard deviation to 1 %; five times that.
     assert found.angle_noise == pytest.approx(NOISE, rel=0.05)
     assert found.speed_noise == 0.0
@@ -100,8 +100,8 @@ def test_an_angle_with_negligible_noise_gives_the_same_gains(found):
 @pytest.mark.parametrize(
     ("source", "window"), [("measured", 1), ("difference", 4), ("observer", 1)]
 )
-def test_simulated_noise_of_an_angle_is_that_of_the_density(found, source, window):
-    """White noise on the angle makes the voltage that its density says, through every source."""
+def test_simulated_control_noise_matches_the_density_of_the_angle_noise(found, source, window):
+    """White angle noise causes the predicted control noise for every speed source."""
     loop = Loop(
         T, gear_ratio=1.0, counts_per_revolution=1e4, speed_source=source, difference_window=window,
         angle_noise=NOISE, supply_voltage=1e6,
@@ -115,7 +115,7 @@ def test_simulated_noise_of_an_angle_is_that_of_the_density(found, source, windo
     assert run.voltage.std() == pytest.approx(problem.control_noise(feedback), rel=0.05)
 
 
-def test_the_choice_reports_the_gains_of_a_longer_difference(found):
+def test_source_choice_suggests_a_longer_difference_window(found):
     loop, why = choose_source(found, loop_of(found))
     assert loop == loop_of(found)
     assert "difference over 1 samples of the loop" in why and "--difference-window 8" in why
@@ -128,7 +128,7 @@ def test_the_choice_reports_the_gains_of_a_longer_difference(found):
     assert "--difference-window" not in choose_source(found, longer)[1]
 
 
-def test_noise_of_an_angle_stays_in_the_file_and_old_files_are_read(found, tmp_path):
+def test_angle_noise_is_stored_and_files_without_it_are_read(found, tmp_path):
     file = tmp_path / "identification.json"
     document = identification_document({"m": found})
     file.write_text(json.dumps(document))
@@ -142,7 +142,7 @@ def test_noise_of_an_angle_stays_in_the_file_and_old_files_are_read(found, tmp_p
         read_identification(file)
 
 
-def test_an_angle_of_counts_has_their_quantisation_alone(record):
+def test_counts_have_no_angle_noise_beyond_quantisation(record):
     per_turn = 2000.0
     count = np.floor(record.position * per_turn / (2 * math.pi)).astype(np.int64)
     hardware = replace(record.hardware, counts_per_revolution=per_turn)

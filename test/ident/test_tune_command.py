@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The command ``tune``: files, exit codes, one-line refusals."""
+"""The command ``tune``: files, exit codes, one-line errors."""
 
 import contextlib
 import json
@@ -108,7 +108,7 @@ def test_small_gains_are_shown_with_their_digits():
 
 
 @pytest.mark.parametrize("export", [[], ["--export", "arduino_pid"]])
-def test_unwritable_folder_is_named_before_a_design(identified, capsys, monkeypatch, export):
+def test_unwritable_output_is_refused_before_the_design(identified, capsys, monkeypatch, export):
     def design(*_: object, **__: object) -> None:
         raise AssertionError("designed before looking")
 
@@ -120,7 +120,7 @@ def test_unwritable_folder_is_named_before_a_design(identified, capsys, monkeypa
     assert "identification.json: cannot be written" in capsys.readouterr().err
 
 
-def test_tune_the_tuning_page_and_the_file_state_one_settling(identified, capsys, monkeypatch):
+def test_terminal_page_and_gains_file_state_the_same_settling_time(identified, capsys, monkeypatch):
     monkeypatch.setattr(tuning_page, "BANDWIDTH_SHARES", (0.6, 1.0))
     monkeypatch.setattr(tuning_page, "PHASE_MARGINS", (60.0,))
     estimates = read_identification(identified)
@@ -199,12 +199,12 @@ def test_unreadable_identification_is_named(tmp_path, capsys):
     assert "identification.json: cannot be read" in capsys.readouterr().err
 
 
-def test_nothing_to_tune_is_told(capsys):
+def test_missing_input_is_refused(capsys):
     assert main([]) == 2
     assert "nothing to tune" in capsys.readouterr().err
 
 
-def test_unknown_supply_is_asked_for(identified, capsys):
+def test_unknown_supply_voltage_is_refused_until_it_is_given(identified, capsys):
     path = identified / "identification.json"
     document = json.loads(path.read_text())
     document["motors"]["rear_left"]["hardware"]["supply_voltage"] = None
@@ -214,7 +214,7 @@ def test_unknown_supply_is_asked_for(identified, capsys):
     assert main([str(identified), "--supply", "12"]) == 0
 
 
-def test_names_in_the_arguments_are_those_that_there_are():
+def test_argument_choices_match_the_implemented_names():
     from smp_motor_ident.cli import tune as arguments
     from smp_motor_ident.tune import METHODS
     from smp_motor_ident.tune.exports import FORMATS

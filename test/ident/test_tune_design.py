@@ -68,7 +68,7 @@ def test_gains_are_volts_per_wheel_speed():
     assert geared.u_clamp_max == 12.0
 
 
-def test_feed_forward_is_the_motors_own_equation():
+def test_feed_forward_inverts_the_motor_equation():
     one = combinations(TABLE[2])
     gains = design(estimate(2, static_voltage=0.35), Loop(gear_ratio=10.0)).gains
     assert gains.feedforward_velocity == pytest.approx(10.0 / one["dc_gain"])
@@ -86,7 +86,7 @@ def test_gains_hold_for_99_percent_of_an_uncertain_motor(method):
     assert one.robustness.holds >= 0.99
 
 
-def test_uncertainty_makes_the_design_back_off_and_say_so():
+def test_uncertainty_reduces_the_gains_with_a_stated_reason():
     sure, unsure = design(estimate(1), Loop()), design(estimate(1, std=0.15), Loop())
     assert unsure.gains.i < sure.gains.i
     assert "gains reduced to" in unsure.reason
@@ -94,7 +94,7 @@ def test_uncertainty_makes_the_design_back_off_and_say_so():
     assert any("no uncertainty" in warning for warning in sure.warnings)
 
 
-def test_robustness_is_judged_on_fresh_draws_as_well():
+def test_robustness_holds_on_an_independent_sample_of_motors():
     """Gains chosen on one sample of the distribution hold on another, with another seed."""
     one = design(estimate(1, std=0.05), Loop(), seed=1)
     fresh = sample(draw_motors(estimate(1, std=0.05), 4000, np.random.default_rng(99)), Loop())
@@ -104,7 +104,7 @@ def test_robustness_is_judged_on_fresh_draws_as_well():
     assert verdict.stable == 1.0
 
 
-def test_longer_delay_and_slower_rate_cost_bandwidth():
+def test_longer_delay_or_lower_rate_reduces_the_bandwidth():
     fast = design(estimate(), Loop(sample_time=0.005, delay=0.001))
     late = design(estimate(), Loop(sample_time=0.005, delay=0.015))
     slow = design(estimate(), Loop(sample_time=0.02))
@@ -112,7 +112,7 @@ def test_longer_delay_and_slower_rate_cost_bandwidth():
     assert fast.margins.crossover > slow.margins.crossover
 
 
-def test_delay_of_the_estimate_counts_like_delay_of_the_loop():
+def test_identified_delay_adds_to_the_loop_delay():
     inside = design(estimate(delay=0.004), Loop(delay=0.003))
     outside = design(estimate(), Loop(delay=0.007))
     assert inside.gains.p == pytest.approx(outside.gains.p, rel=1e-9)
@@ -174,7 +174,7 @@ def test_the_acceleration_named_in_a_refusal_is_accepted():
     assert one.reference.max_acceleration / 65.5 <= limit
 
 
-def test_motor_that_friction_holds_is_refused():
+def test_motor_held_by_friction_is_refused():
     with pytest.raises(DesignError, match="cannot turn"):
         design(estimate(static_voltage=11.5), Loop())
 
@@ -185,7 +185,7 @@ def test_estimate_without_dynamics_is_refused():
         design(bare, Loop())
 
 
-def test_comparison_recommends_a_sound_design_for_a_reason():
+def test_comparison_recommends_a_robust_design_with_a_reason():
     results = compare(estimate(0, std=0.01), Loop())
     assert set(results) == set(METHODS)
     name, reason = recommend(results)
@@ -223,7 +223,7 @@ def test_draws_of_positive_quantities_stay_positive_however_uncertain():
     assert np.all(drawn.a1 / drawn.a0 > 0) and np.all(1 / drawn.a0 == 25.0)
 
 
-def test_comparison_keeps_the_refusals_apart():
+def test_comparison_returns_refusals_per_method():
     results = compare(estimate(), Loop(), bandwidth=1000.0)
     assert isinstance(results["margin"], DesignError)
     assert not isinstance(results["simc"], DesignError)
@@ -238,7 +238,7 @@ def four(spread: float) -> dict[str, Estimate]:
     return found
 
 
-def test_alike_motors_share_one_set_of_gains():
+def test_similar_motors_share_one_set_of_gains():
     found = four(0.005)
     wheels = design_wheels(found, dict.fromkeys(found, Loop()))
     assert wheels.reason.startswith("one set of gains for all")
@@ -247,7 +247,7 @@ def test_alike_motors_share_one_set_of_gains():
         assert one.robustness.holds >= 0.99
 
 
-def test_motors_that_differ_get_gains_of_their_own_and_one_reference():
+def test_different_motors_get_separate_gains_and_a_common_reference():
     found = {f"wheel_{k}": replace(estimate(k), wheel=f"wheel_{k}") for k in range(4)}
     wheels = design_wheels(found, dict.fromkeys(found, Loop()))
     assert wheels.reason.startswith("one set of gains each")
@@ -257,7 +257,7 @@ def test_motors_that_differ_get_gains_of_their_own_and_one_reference():
         assert len({round(getattr(plan, name), 9) for plan in plans}) == 1
 
 
-def test_one_set_for_motors_that_differ_holds_for_all_of_them():
+def test_common_gains_for_different_motors_are_robust_for_all():
     found = {f"wheel_{k}": replace(estimate(k, 0.01), wheel=f"wheel_{k}") for k in range(4)}
     wheels = design_wheels(found, dict.fromkeys(found, Loop()), sets="one")
     assert wheels.reason.startswith("one set of gains for all")
@@ -265,7 +265,7 @@ def test_one_set_for_motors_that_differ_holds_for_all_of_them():
         assert one.robustness.holds >= 0.99
 
 
-def test_wheels_together_share_the_limits_of_the_weakest():
+def test_coordinated_wheels_share_the_limits_of_the_weakest():
     found = {f"wheel_{k}": replace(estimate(k), wheel=f"wheel_{k}") for k in range(4)}
     loops = dict.fromkeys(found, Loop())
     together = design_wheels(found, loops)

@@ -23,15 +23,15 @@ from smp_motor_ident.tune.verification import loop_settings
 from smp_motor_ident.tune.writing import parameters
 
 
-def test_changes_leave_room_for_a_load_that_the_recording_shows():
+def test_reference_leaves_voltage_margin_for_an_identified_load():
     plain, uphill = (design(estimate(load_voltage=x), LOOP) for x in (0.0, -2.0))
     less = plain.reference.drive.top_speed - uphill.reference.drive.top_speed
     assert less == pytest.approx(2.0 * MOTOR["dc_gain"])
     assert uphill.reference.max_velocity < plain.reference.max_velocity
 
 
-def test_bands_hold_a_load_that_friction_held_before_the_change():
-    """Feed-forward knows of friction alone: the integral has the load still to find."""
+def test_bands_cover_a_load_held_by_friction_before_the_change():
+    """Feed-forward compensates friction only; the load is left to the integral action."""
     uphill = {**TRUE, "load_voltage": 0.35}
     aware, ignorant = design(estimate(load_voltage=0.35), LOOP), design(estimate(), LOOP)
     time, speed = change(aware, uphill)
@@ -43,7 +43,7 @@ def test_bands_hold_a_load_that_friction_held_before_the_change():
     assert downhill <= aware.specification.overshoot.high + 0.25
 
 
-def test_jitter_of_instants_widens_the_bands():
+def test_torque_noise_and_timing_jitter_widen_the_bands():
     rough = 0.02 * MOTOR["dc_gain"] / MOTOR["time_constant"]  # 0.02 V sqrt(s)
     load = Finding("torque_noise", "warning", "", {"acceleration": rough})
     assert compute_torque_noise(estimate(findings=[load]), 0.01) == pytest.approx(0.2)
@@ -54,11 +54,11 @@ def test_jitter_of_instants_widens_the_bands():
     assert math.isnan(shaken.specification.settling.high)
     assert math.isfinite(scattered.specification.settling.high)
     assert scattered.specification.settling.high >= exact.specification.settling.high
-    assert scattered.reference.doubt == pytest.approx(3e-3)  # and is no slower than it must
+    assert scattered.reference.doubt == pytest.approx(3e-3)  # the transition is not lengthened
 
 
-def test_bands_hold_an_encoder_that_is_off_once_a_turn_as_the_recording_shows():
-    """By a count of 32 a turn, at either end of a change."""
+def test_overshoot_band_covers_an_identified_encoder_eccentricity():
+    """The eccentricity is one count of 32 per turn."""
     count = 2 * math.pi / 32
     counts = replace(LOOP, counts_per_revolution=32.0)
     chain = ChainRecord(("encoder_error",), {"eccentricity": count, "eccentric_phase": 0.0})
@@ -67,20 +67,20 @@ def test_bands_hold_an_encoder_that_is_off_once_a_turn_as_the_recording_shows():
     assert shaken.overshoot.high > true.overshoot.high + 1.0
 
 
-def test_bands_hold_a_load_that_fluctuates_as_the_recording_shows():
-    """A speed that wanders with a deviation s reaches several s beyond the change."""
+def test_overshoot_band_covers_identified_torque_noise():
+    """Speed noise of standard deviation s adds several s of overshoot."""
     rough = 0.5 * MOTOR["dc_gain"] / MOTOR["time_constant"] * 0.1  # 0.5 V over 10 ms
     noise = Finding("torque_noise", "warning", "a load that fluctuates", {"acceleration": rough})
     steady, shaken = (design(estimate(findings=f), LOOP) for f in ([], [noise]))
     wander = 100 * rough * math.sqrt(0.5 * MOTOR["time_constant"]) / shaken.specification.change
     more = shaken.specification.overshoot.high - steady.specification.overshoot.high
-    assert 1.0 * wander < more < 6.0 * wander  # of the speed without a loop, which takes some off
+    assert 1.0 * wander < more < 6.0 * wander  # the loop reduces it
     springs = ResidualTests(model_error=ModelError((30.0, 200.0), (0.0, 3.0), (0.1, 3.5)))
     assert compute_torque_noise(replace(estimate(findings=[noise]), residuals=springs), 0.01) == 0.0
 
 
-def test_outliers_do_not_reach_the_loop():
-    """Of a speed whose noise is known: two in a hundred, most of them within half of the top."""
+def test_outliers_of_the_speed_are_rejected_by_the_loop():
+    """2 % of the readings of a noisy speed are outliers of up to the top speed."""
     found = Finding("glitches", "warning", "", {"signal": "velocity", "samples": 20.0})
     counts = replace(LOOP, counts_per_revolution=None, speed_noise=1.0, difference_window=0)
     one = design(replace(estimate(findings=[found]), samples=1000), counts)
@@ -93,7 +93,7 @@ def test_outliers_do_not_reach_the_loop():
     rng, true, T = np.random.default_rng(5), 0.0, LOOP.sample_time
     lost, believed = [], []
     for k in range(6000):
-        volts = 11.0 if k // 60 % 2 else -11.0  # as fast as it can, there and back
+        volts = 11.0 if k // 60 % 2 else -11.0  # reversals at nearly full voltage
         true += (MOTOR["dc_gain"] * volts - true) * -math.expm1(-T / MOTOR["time_constant"])
         outlier = rng.random() < 0.02
         reading = true + rng.normal() + outlier * rng.uniform(-250.0, 250.0)
@@ -106,7 +106,7 @@ def test_outliers_do_not_reach_the_loop():
     assert np.mean(lost) < 0.005 and len(believed) > 20 and np.mean(believed) < 0.1
 
 
-def test_counts_that_replace_an_observer_are_differenced_over_the_tolerated_window():
+def test_fallback_difference_window_of_an_observer_stays_within_the_delay_margin():
     """Over one sample a count of 48 would be 65 rad/s, or 12 V with an observer's gains."""
     fast = replace(LOOP, sample_time=0.002, delay=0.002, speed_source="observer")
     for counts, longer in ((48.0, True), (1e5, False)):
@@ -120,7 +120,7 @@ def test_counts_that_replace_an_observer_are_differenced_over_the_tolerated_wind
     assert parameters(design(estimate(), given))["difference_window"] == 1
 
 
-def test_noise_of_a_recorded_speed_limits_the_gains():
+def test_identified_speed_noise_limits_the_gains():
     """Measurement noise enters the voltage; a design that knows it limits the gains."""
     rng = np.random.default_rng(4)
     T, n, noise = 0.002, 6000, 6.0
@@ -133,7 +133,7 @@ def test_noise_of_a_recorded_speed_limits_the_gains():
     usual = parser().parse_args(["identification"])
     loop = tuning.loop_for(found, usual)
     assert loop.speed_noise == found.speed_noise
-    # It was recorded as it is at each instant: an average would have been identified.
+    # The speed is instantaneous: an averaging window would have been identified.
     assert loop.difference_window == 0
     one, deaf = design(found, loop), design(found, replace(loop, speed_noise=0.0))
     heard = prepare(found, loop, "margin", {}).problem
@@ -143,8 +143,8 @@ def test_noise_of_a_recorded_speed_limits_the_gains():
     assert one.specification.overshoot.high > deaf.specification.overshoot.high
 
 
-def test_no_settling_is_stated_for_a_speed_rounded_beyond_its_band():
-    """Within a step the loop sees nothing; as noise of that size it would average it."""
+def test_settling_is_not_stated_if_speed_quantisation_exceeds_its_band():
+    """Within a quantum the loop sees no error; noise of that size would average out."""
     step = 0.1 * 0.5 * 240.0
     smooth = replace(
         LOOP, counts_per_revolution=None, difference_window=0, speed_noise=0.289 * step
@@ -152,8 +152,8 @@ def test_no_settling_is_stated_for_a_speed_rounded_beyond_its_band():
     steps = replace(smooth, speed_step=step)
     seen, rounded = (design(estimate(), x, max_velocity=240.0) for x in (smooth, steps))
     assert rounded.gains == seen.gains and math.isnan(rounded.specification.settling.high)
-    assert rounded.specification.overshoot.high > 3.0  # half of a step, less what sees it
-    assert replace(steps, speed_noise=0.4 * step).rounding == 0.0  # of so much noise it is a mean
+    assert rounded.specification.overshoot.high > 3.0  # half of a quantum, less the measured part
+    assert replace(steps, speed_noise=0.4 * step).rounding == 0.0  # noise dithers the quantum
     fine = design(estimate(), replace(steps, speed_noise=0.03 * step, speed_step=0.1 * step))
     assert math.isfinite(fine.specification.settling.high)
     rng, T = np.random.default_rng(8), 0.01

@@ -23,7 +23,7 @@ BENCH = load("exports")
 
 
 @pytest.mark.parametrize("name", FORMATS)
-def test_the_targets_own_arithmetic_settles_and_overshoots_as_specified(name):
+def test_target_arithmetic_settles_and_overshoots_as_specified(name):
     motors = [*BENCH.TABLE_1.values(), *BENCH.random_motors(1)]
     for motor in motors:
         _, _, over, overshot, peak, kept = BENCH.attempt(name, motor)
@@ -58,7 +58,7 @@ def test_export_writes_parameters_and_limitations(name, tmp_path, capsys):
     assert "exists" in capsys.readouterr().err
 
 
-def test_whole_numbers_that_let_an_error_rest_are_named():
+def test_integer_gains_report_their_steady_state_error():
     target = FORMATS["ros_arduino_bridge"]
     loop = Loop(
         sample_time=1 / 30, counts_per_revolution=11.0, speed_source="difference", gear_ratio=30.0
@@ -73,7 +73,7 @@ def test_whole_numbers_that_let_an_error_rest_are_named():
     assert check(one, gains).resting_error > 0
 
 
-def test_intervals_that_a_target_cannot_have_are_refused_with_the_nearest(tmp_path, capsys):
+def test_unsupported_control_interval_is_refused_with_the_nearest_rate(tmp_path, capsys):
     for name, rate, nearest in (
         ("arduino_pid", "300", "--rate 333.333"),
         ("ros_arduino_bridge", "30", "--rate 30.303"),  # 1000 / 30 in whole numbers
@@ -92,7 +92,7 @@ def test_a_wheel_blocked_at_full_speed_does_not_overflow_16_bits():
 
 
 @pytest.mark.parametrize("name", FORMATS)
-def test_no_text_of_an_identification_leaves_its_comment(tmp_path, capsys, name):
+def test_identification_texts_cannot_escape_comments_in_exports(tmp_path, capsys, name):
     hostile = "a\\\n#define EVIL 1"
     finding = {"code": "x", "severity": "warning", "message": hostile, "evidence": {}, "advice": ""}
     document = identification_document({"robot1/left": estimate()})

@@ -43,7 +43,7 @@ class Reduced(Problem):
         object.__setattr__(self, "reduced", model)
 
 
-def test_ziegler_nichols_and_tyreus_luyben_give_their_published_shares():
+def test_ziegler_nichols_and_tyreus_luyben_match_their_published_rules():
     assert apply_rule("ziegler_nichols", "pi", 2.0, 1.2) == Feedback(0.9, 0.9)
     pid = apply_rule("ziegler_nichols", "pid", 2.0, 1.0)
     assert (pid.p, pid.p / pid.i, pid.d / pid.p) == pytest.approx((1.2, 0.5, 0.125))
@@ -53,7 +53,7 @@ def test_ziegler_nichols_and_tyreus_luyben_give_their_published_shares():
     assert (pid.p, pid.p / pid.i, pid.d / pid.p) == pytest.approx((1.0, 2.2 * 6.3, 1.0))
 
 
-def test_simc_solves_skogestads_example():
+def test_simc_reproduces_skogestads_example():
     # Process E1 of the SIMC paper, 1/((s+1)(0.2s+1)): half rule tau 1.1, theta 0.1, and with
     # tau_c = theta a PI controller of Kc 5.5 and tau_I 0.8.
     feedback = METHODS["simc"].solve(Reduced(FirstOrderDelay(1.0, 1.1, 0.1)))
@@ -68,7 +68,7 @@ def test_half_rule_keeps_the_sum_of_time_constants_and_delays():
     assert one.reduced.time_constant + one.reduced.delay == pytest.approx(a1 / a0 + 0.002)
 
 
-def test_simc_cancels_the_pole_and_closes_the_loop_as_asked():
+def test_simc_cancels_the_pole_and_meets_the_closed_loop_time_constant():
     feedback = METHODS["simc"].solve(
         Reduced(FirstOrderDelay(2.0, 0.5, 0.1), closed_loop_time_constant=0.4)
     )
@@ -155,7 +155,7 @@ def test_relay_feedback_tolerates_lost_samples():
     assert asked == pytest.approx(whole, rel=0.05)
 
 
-def test_relay_is_evaluated_between_pauses_of_its_computer():
+def test_relay_oscillation_is_evaluated_between_gaps_in_the_samples():
     one = problem(PAPER[3])
     voltage, speed = oscillate(one, 3.0, one.loop.count_angle / 0.005, 4.0)
     period = read_oscillation([(voltage, speed)], 0.005)[1]
@@ -171,7 +171,7 @@ def test_relay_is_evaluated_between_pauses_of_its_computer():
     assert read_oscillation(stretches, step) == pytest.approx(whole, rel=0.02)
 
 
-def test_relay_without_samples_or_oscillation_is_told():
+def test_relay_without_samples_or_oscillation_is_refused():
     with pytest.raises(DesignError, match="only 1 samples"):
         resample_evenly({key: [0.0] for key in ("time", "voltage", "applied", "speed", "angle")})
     with pytest.raises(DesignError, match="steady cycles"):
@@ -180,7 +180,7 @@ def test_relay_without_samples_or_oscillation_is_told():
 
 @pytest.mark.parametrize("coefficients", PAPER)
 @pytest.mark.parametrize("sample_time", [0.01, 0.005, 0.001])
-def test_margin_method_keeps_margin_sensitivity_and_ripple(coefficients, sample_time):
+def test_margin_method_meets_phase_margin_sensitivity_and_noise_limits(coefficients, sample_time):
     one = problem(coefficients, sample_time)
     one = replace(one, loop=replace(one.loop, noise_voltage=one.loop.noise_limit))
     feedback = METHODS["margin"].solve(one)
@@ -203,7 +203,7 @@ def test_margin_method_rejects_loads_no_worse_than_simc(coefficients, sample_tim
     assert feedback.i >= 1.01 * simc.i
 
 
-def test_margin_method_does_not_let_counts_shake_the_wheel_out_of_its_band():
+def test_margin_method_limits_speed_noise_from_coarse_counts():
     # A light motor with 24 counts a turn: without the limit they would move it three times as far.
     one = problem((1 / 34.0, 0.01 / 34.0, 0.019 * 0.01**2 / 34.0), 0.01)
     loop = replace(one.loop, counts_per_revolution=24.0, noise_voltage=2.0)
@@ -218,21 +218,21 @@ def test_margin_method_does_not_let_counts_shake_the_wheel_out_of_its_band():
 
 
 def speed_noise_factor(one, feedback) -> float:
-    """Return what noise shakes the wheel by, over the usual limit."""
+    """Return the speed noise relative to its default limit."""
     through = feedback.response(one.omega, one.loop.sample_time)
     through = through * one.true_response / (1 + through * one.response)
     top = one.loop.supply_voltage / one.plant.motors.a0[0]
     return float(one.noise_rms(through) / (2.5e-3 * top))
 
 
-def test_a_noisy_speed_does_not_leave_a_load_to_itself():
-    """With 7 % of noise the limit of shaking alone would leave 32 mV where 480 mV are allowed."""
+def test_speed_noise_limit_is_relaxed_to_keep_load_rejection():
+    """With 7 % of speed noise its limit alone would leave 32 mV of the 480 mV allowed."""
     one = problem((1 / 114.0, 0.2 / 114.0, 0.0), 0.018)
     loop = replace(one.loop, counts_per_revolution=None, difference_window=0, speed_noise=90.0)
     strict = Problem(sample(one.plant.motors, loop), replace(loop, noise_voltage=loop.noise_limit))
     still, found = (METHODS["margin"].solve(p) for p in (strict, replace(strict, loop=loop)))
     assert speed_noise_factor(strict, still) <= 1.0
-    # What shakes a slow loop goes with the root of its bandwidth: 1.2^8 squared is 18.
+    # Speed noise of a slow loop grows with the root of its bandwidth: 1.2^8 squared is 18.
     assert found.i > 10 * still.i
     assert strict.control_noise(found) <= loop.noise_limit
     margins = loop_margins(strict.plant, found)
@@ -258,14 +258,14 @@ def test_margin_method_rejects_a_load_better_than_a_grid_of_pi_gains():
         assert m.phase < 60 or m.sensitivity > 1.4 or hump > 1.25 or not m.stable
 
 
-def test_bandwidth_is_met_where_it_can_be():
+def test_feasible_bandwidth_is_met():
     one = problem(bandwidth=15.0)
     margins = loop_margins(one.plant, METHODS["margin"].solve(one))
     assert margins.crossover == pytest.approx(15.0, rel=1e-3)
 
 
 @pytest.mark.parametrize("wished", [150.0, 5000.0])
-def test_bandwidth_beyond_the_delay_is_refused_with_the_nearest(wished):
+def test_infeasible_bandwidth_is_refused_with_the_nearest_feasible_one(wished):
     with pytest.raises(DesignError, match="the nearest that holds is") as refusal:
         METHODS["margin"].solve(problem(bandwidth=wished))
     words = str(refusal.value).split()

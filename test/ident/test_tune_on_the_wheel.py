@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Designed gains on the loop that runs: the wheel's own controller on the simulated hardware."""
+"""Designed gains on the running wheel controller with simulated hardware."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -83,12 +83,12 @@ def test_the_wheel_loop_applies_the_designed_feed_forward(estimates, share, T, s
     np.testing.assert_allclose(references, planned.reference, atol=1e-9 * target)
     forward = planned.forward + static * planned.friction
     np.testing.assert_allclose(outs, forward, atol=1e-9 * 12)
-    # From rest more than the friction is led: the rate of its current.
+    # From rest the feed-forward exceeds friction: it includes the rate of its current.
     assert planned.friction.max() > 1.5
 
 
-def test_a_clamped_lead_without_an_error_leaves_the_simulated_integral_alone(estimates):
-    """As the running controller, which takes nothing back while a measurement is left alone."""
+def test_saturated_feed_forward_without_error_does_not_wind_the_integral(estimates):
+    """As in the running controller, there is no back-calculation while the error is zero."""
     plant = sample(make_motors(estimates["front_left"]), Loop(sample_time=0.005))
     controller = Controller(Feedback(0.1, 1.0), limit=12.0, tracking=0.01)
     lead = np.where(np.arange(40) < 3, 20.0, 5.0)
@@ -98,7 +98,7 @@ def test_a_clamped_lead_without_an_error_leaves_the_simulated_integral_alone(est
 
 @pytest.mark.parametrize("rate", [100.0, 200.0, 1000.0])
 @pytest.mark.parametrize("share", [0.3, 0.6])
-def test_a_wheel_alone_is_as_fast_as_its_voltage_allows(estimates, rate, share):
+def test_single_wheel_settles_as_fast_as_its_voltage_allows(estimates, rate, share):
     T = 1 / rate
     one = design(estimates["rear_right"], Loop(sample_time=T))
     drive, ratio = one.reference.drive, one.loop.gear_ratio
@@ -114,7 +114,7 @@ def test_a_wheel_alone_is_as_fast_as_its_voltage_allows(estimates, rate, share):
     assert run.velocity.max() < 1.02 * target
 
 
-def test_a_reversal_turns_the_friction_voltage_in_time(estimates):
+def test_friction_feed_forward_switches_in_time_at_a_reversal(estimates):
     T = 0.005
     designs = design_wheels(estimates, {wheel: Loop(sample_time=T) for wheel in estimates}).designs
     for wheel, one in designs.items():
@@ -124,7 +124,7 @@ def test_a_reversal_turns_the_friction_voltage_in_time(estimates):
 
 
 @pytest.mark.parametrize("rate", [1.0, 2.0, 4.0, 5.0, 10.0, 20.0])
-def test_gains_for_a_slow_loop_drive_its_wheel(estimates, rate):
+def test_slow_loop_reaches_its_set_point_despite_lost_samples(estimates, rate):
     T, entry = 1 / rate, load_motors(MOTORS)["front_left"]
     one = design(estimates["front_left"], Loop(sample_time=T))
     written = flatten(parameters(one))
@@ -141,7 +141,7 @@ def test_gains_for_a_slow_loop_drive_its_wheel(estimates, rate):
     for k in range(1, 80):
         now = 100.0 + k * T
         if k % 7 == 3:
-            continue  # a sample is lost now and then
+            continue  # every seventh sample is lost
         sample = plant.sample(now)
         wheel.take_setpoint(target, now)
         late = now + 0.05 * T

@@ -60,7 +60,7 @@ def test_sampled_motor_with_any_delay_and_window_is_exact(coefficients, delay, w
     plant = sample(
         motors(*coefficients), Loop(sample_time=T, delay=delay, difference_window=window)
     )
-    # A controller that is nothing but feed-forward plays the inputs into the loop.
+    # A pure feed-forward controller applies the inputs.
     run = simulate(plant, Controller(Feedback(0.0, 0.0)), Inputs(np.zeros(25), forward=inputs))
     # 1e-7 of the largest speed: the ODE solver's own tolerance, accumulated.
     np.testing.assert_allclose(run.speed[0], speed[:-1], atol=1e-7 * np.abs(speed).max())
@@ -77,7 +77,7 @@ def test_sampled_motor_with_any_delay_and_window_is_exact(coefficients, delay, w
     assert abs(found - ratio) < 1e-6 * abs(ratio)
 
 
-def test_frequency_response_tends_to_the_motor_at_low_frequency():
+def test_frequency_response_tends_to_the_static_gain_at_low_frequency():
     plant = sample(motors(*MOTOR_1), Loop(sample_time=0.001, delay=0.0))
     # At 1 mrad/s what differs from the static gain is below 1e-4.
     assert abs(plant.response(np.array([1e-3]))[0, 0]) == pytest.approx(1 / MOTOR_1[0], rel=1e-4)
@@ -126,7 +126,7 @@ def test_the_simulated_controller_equals_the_running_one():
 
 
 def random_loop(rng):
-    """A loop at random: resonant, late by many samples, or as slow as its sampling."""
+    """Return a random loop: resonant, delayed by many samples, or as slow as its sampling."""
     T = 10 ** rng.uniform(-3, -1.7)
     gain, tau = 10 ** rng.uniform(-1, 1), T * 10 ** rng.uniform(0, 2)
     damping = rng.choice([rng.uniform(0.03, 0.2), rng.uniform(0.5, 3), np.inf])
@@ -171,7 +171,7 @@ def test_margins_agree_with_python_control():
     assert min(several, beyond, nyquist) >= 3
 
 
-def test_coarse_grid_of_a_batch_reads_the_same_margins():
+def test_margins_on_a_coarse_frequency_grid_agree_with_exact_ones():
     rng, errors = np.random.default_rng(1), []
     while len(errors) < 100:
         plant, feedback = random_loop(rng)
@@ -200,9 +200,9 @@ def test_gain_and_delay_margin_are_where_the_loop_turns_unstable(sample_time):
 
 
 @pytest.mark.parametrize("delay", [0.07, 0.09, 0.11, 0.13])
-def test_delay_margin_counts_the_lag_to_the_next_turn_where_the_phase_is_beyond_180_deg(delay):
+def test_delay_margin_is_correct_where_the_phase_lag_exceeds_180_deg(delay):
     # A resonance of damping 0.05 at 20 rad/s that an integral and a long delay cross again, with
-    # phases between -180 and -540 deg: the loop is stable, and bears another 100 to 170 ms.
+    # phases between -180 and -540 deg: the loop is stable, and tolerates another 100 to 170 ms.
     resonant, feedback = motors(1.0, 2 * 0.05 / 20, 1 / 20**2), Feedback(0.0, 4.0)
     margins = loop_margins(sample(resonant, Loop(sample_time=0.005, delay=delay)), feedback)
     for share, stable in ((0.0, True), (0.99, True), (1.01, False)):

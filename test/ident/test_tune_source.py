@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The observer in the loop, and the choice of where the speed comes from."""
+"""The observer in the loop, and the choice of the speed source."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -36,7 +36,7 @@ def observed(rate: float, **more) -> Loop:
     return Loop(sample_time=1 / rate, speed_source="observer", **more)
 
 
-def test_an_observer_with_the_right_model_sees_the_speed_itself(estimates):
+def test_observer_with_the_true_model_reproduces_the_true_speed(estimates):
     motors = make_motors(estimates["front_left"])
     loop = observed(200.0, delay=0.01)  # whole samples: the mean voltage is the voltage
     omega = np.geomspace(1.0, 600.0, 50)
@@ -45,7 +45,7 @@ def test_an_observer_with_the_right_model_sees_the_speed_itself(estimates):
     np.testing.assert_allclose(seen, true, rtol=1e-6)  # rounding of the matrix exponential
 
 
-def test_the_response_of_a_wrong_model_is_that_of_the_simulated_loop(estimates):
+def test_response_with_a_wrong_observer_model_matches_the_simulated_loop(estimates):
     believed = make_motors(estimates["front_left"])
     actual = Motors(
         1.1 * believed.a0, 0.9 * believed.a1, believed.a2, believed.delay, believed.static_voltage
@@ -112,18 +112,18 @@ def test_at_1_khz_the_observer_is_chosen_with_its_reason(estimates):
     assert better.performance.control_noise <= 1.01 * 0.48
 
 
-def test_at_200_hz_the_reported_speed_does(estimates):
+def test_at_200_hz_the_reported_speed_is_chosen(estimates):
     loop, _ = choose_source(estimates["rear_left"], Loop(sample_time=0.005))
     assert loop.speed_source == "measured"
 
 
-def test_without_counts_there_is_nothing_to_choose(estimates):
+def test_measured_speed_is_chosen_without_counts(estimates):
     loop, why = choose_source(estimates["rear_left"], Loop(counts_per_revolution=None))
     assert loop.speed_source == "measured"
     assert "not known" in why
 
 
-def test_counts_may_be_named_for_a_motor_that_a_recorded_speed_told(estimates):
+def test_source_is_chosen_with_given_counts_after_identification_from_speed(estimates):
     loop, why = choose_source(
         estimates["rear_left"], Loop(sample_time=0.001, difference_window=0, speed_noise=0.5)
     )
@@ -131,7 +131,7 @@ def test_counts_may_be_named_for_a_motor_that_a_recorded_speed_told(estimates):
     assert "the reported speed allows" in why
 
 
-def test_the_choice_is_printed_and_can_be_overruled(tmp_path, capsys):
+def test_speed_source_is_printed_and_can_be_overridden(tmp_path, capsys):
     for source in ("auto", "measured"):
         output = tmp_path / f"{source}.yaml"
         options = ["--rate", "1000", "--speed-source", source, "--output", str(output)]
@@ -141,7 +141,7 @@ def test_the_choice_is_printed_and_can_be_overruled(tmp_path, capsys):
         assert f"speed_source: {chosen}" in output.read_text()
 
 
-def test_a_missing_design_repeats_the_advice_of_warnings_only(estimates):
+def test_design_refusal_repeats_only_the_advice_of_warnings(estimates):
     found = (
         Finding("not_separable", "note", "a family", advice="record the motor current too"),
         Finding("one_level", "warning", "one level", advice="record two levels of voltage"),
@@ -152,8 +152,8 @@ def test_a_missing_design_repeats_the_advice_of_warnings_only(estimates):
     assert "current too" not in str(refused.value)
 
 
-def test_an_observer_that_the_driver_contradicts_is_not_taken_nor_its_settling_stated(estimates):
-    """It predicts from the command, from which a coasting driver's voltage differs."""
+def test_observer_of_a_coasting_driver_is_not_chosen_nor_its_settling_stated(estimates):
+    """The observer predicts from the command, which differs from a coasting driver's voltage."""
     coast = ChainRecord(("coast",), {"fast_decay_ratio": 10.0, "viscous": 0.2})
     plain = replace(estimates["front_left"], findings=())
     coasting, loop = replace(plain, chain=coast, largest_voltage=12.0), observed(500.0)

@@ -27,7 +27,7 @@ DOUBT = Finding("dead_zone", "unreliable", "a dead zone of 2 V", {}, "record slo
 @pytest.mark.parametrize(
     ("sensor", "name"), [({"window": 0.05}, "averaging_window"), ({"lag": 0.04}, "sensor_lag")]
 )
-def test_gains_are_of_the_speed_that_the_firmware_reports(sensor, name):
+def test_design_accounts_for_the_speed_filter_of_the_firmware(sensor, name):
     value = next(iter(sensor.values()))
     aware, ignorant = design(estimate(**{name: value}), LOOP), design(estimate(), LOOP)
     # A quarter of a percent: the test's integration in steps of a fiftieth.
@@ -40,8 +40,8 @@ def test_gains_are_of_the_speed_that_the_firmware_reports(sensor, name):
 
 
 @pytest.mark.parametrize("share", [0.05, 0.5])
-def test_a_lag_that_may_be_the_sensors_causes_no_overshoot(share):
-    """The motor is ahead of a filter: led as if the lag were its own, it leaves its bands."""
+def test_lag_possibly_of_the_sensor_causes_no_overshoot(share):
+    """The motor leads its filtered speed: feed-forward for the whole lag overshoots."""
     doubt = Share("low_passed_speed", 0.3, 0.045)
     lags = {"time_constant": 0.15, "time_constant_product": 0.1 * 0.05}
     filtered = {**TRUE, "time_constant": 0.1, "time_constant_product": 1e-4}
@@ -59,8 +59,8 @@ def test_a_lag_that_may_be_the_sensors_causes_no_overshoot(share):
     assert any("filter" in words for words in aware.warnings)
 
 
-def test_changes_are_no_faster_than_the_driver():
-    """A driver that ramps follows the feed-forward of every change without lag."""
+def test_reference_changes_stay_within_the_driver_slew_rate():
+    """A slew-limited driver follows the feed-forward of every change without lag."""
     slewed = ChainRecord(("slew",), {"ramp_time": 12.0 / 40.0})
     one = design(replace(estimate(), chain=slewed, largest_voltage=12.0), LOOP)
     plan, gains, T = one.reference, one.gains, LOOP.sample_time
@@ -78,7 +78,7 @@ def test_changes_are_no_faster_than_the_driver():
     assert one.specification.overshoot.high < 5.0
 
 
-def test_gains_from_one_size_of_voltage_hold_at_others():
+def test_gains_identified_at_one_voltage_amplitude_hold_at_others():
     """A driver that is clipped where it was recorded has a fifth more gain at half the speed."""
     level = Finding("one_size_of_voltage", "warning", "the voltage has one size, 12 V")
     moves = {"dc_gain": 0.1 * TRUE["dc_gain"], "static_voltage": -0.1 * TRUE["static_voltage"]}
@@ -116,7 +116,7 @@ def margins_on(motor, made):
     return loop_margins(sample(motor, made.loop), made.feedback)
 
 
-def test_a_second_lag_that_the_record_hides_is_within_the_stated_margins():
+def test_stated_margins_cover_an_unidentified_second_lag():
     one_lag = estimate(time_constant_product=0.0)
     product = Quantity(None, None, (0.0, 4e-4), "s^2", "unidentifiable")
     hidden = replace(
@@ -130,7 +130,7 @@ def test_a_second_lag_that_the_record_hides_is_within_the_stated_margins():
     assert real.gain > aware.specification.gain_margin.low
     assert real.sensitivity < aware.specification.sensitivity.high
     assert unaware.phase < ignorant.specification.phase_margin.low - 3.0
-    # No more is taken for open than two lags of one motor can be.
+    # The interval is limited to the lags that one motor can have.
     product = replace(product, ci95=(0.0, 1.0))
     wide = replace(hidden, combinations={**hidden.combinations, "time_constant_product": product})
     assert design(wide, LOOP).margins.stable
@@ -142,9 +142,9 @@ def test_a_second_lag_that_the_record_hides_is_within_the_stated_margins():
         ({"time_constant_product": 1e-3}, {"delay": 0.01, "time_constant": 0.09}),
         ({"sensor_lag": 0.01}, {"averaging_window": 0.02}),
     ],
-    ids=["a delay for a second lag", "a mean for a filter"],
+    ids=["delay for second lag", "average for filter"],
 )
-def test_motors_that_the_record_does_not_exclude_keep_the_stated_margins(stated, other):
+def test_stated_margins_cover_motors_confounded_with_the_estimate(stated, other):
     loop = replace(LOOP, sample_time=0.005, delay=0.005)
     motor = {"time_constant": 0.1, "time_constant_product": 0.0}
     known = estimate(std=0.002, **{**motor, **stated})
@@ -161,7 +161,7 @@ def test_motors_that_the_record_does_not_exclude_keep_the_stated_margins(stated,
     assert unaware.sensitivity > ignorant.specification.sensitivity.high + 0.03
 
 
-def test_an_unreliable_identification_is_refused_or_widens_the_design():
+def test_unreliable_identification_is_refused_or_lowers_the_gains_if_accepted():
     with pytest.raises(DesignError, match=r"unreliable: a dead zone of 2 V \(record slow ramps\)"):
         design(estimate(findings=[DOUBT]), LOOP)
     sure = design(estimate(), LOOP)
@@ -199,12 +199,12 @@ def test_the_lower_end_of_a_friction_range_is_fed_forward():
     for friction in (0.6, 1.5, 2.4):
         true = {**TRUE, "static_voltage": friction}
         assert overshoot(one, true) <= one.specification.overshoot.high + 0.25
-    # The reference leaves room for all that it may take.
+    # The reference leaves voltage for the upper end of the range.
     assert one.reference.max_velocity <= 25.0 * (0.92 * 12.0 - 2.4)
 
 
-def test_coarse_counts_cost_no_more_than_the_limits_ask_for():
-    """Of PI and PID gains of a dense grid within margins and control noise none is far better."""
+def test_integral_gain_with_coarse_counts_is_near_the_optimum_of_a_grid():
+    """No PI gains of a dense grid within margins and control noise are far better."""
     loop = replace(LOOP, counts_per_revolution=48.0, noise_voltage=0.48)
     one = design(estimate(), loop, structure="pi")
     problem = Problem(sample(make_motors(estimate()), loop), loop)
@@ -239,7 +239,7 @@ def test_command_refuses_an_unreliable_result_unless_it_is_accepted(tmp_path, ca
 
 
 @pytest.mark.parametrize("seed", range(6))
-def test_any_inductance_at_any_rate_ends_in_stable_gains(seed):
+def test_gains_are_stable_for_random_inductance_and_sampling_rate(seed):
     """The short version of ``benchmarks/random_designs.py``."""
     rng = np.random.default_rng(seed)
     electrical, rate = 10 ** rng.uniform(-5, -2), 20 * 250 ** rng.uniform()
@@ -256,8 +256,8 @@ def test_any_inductance_at_any_rate_ends_in_stable_gains(seed):
     assert math.isfinite(one.specification.settling.value)
 
 
-def test_a_fast_loop_must_tolerate_only_the_delay_it_can():
-    """Two milliseconds are ten samples at 5 kHz: such an answer would be unstable."""
+def test_delay_uncertainty_of_a_fast_loop_is_limited_by_its_delay_margin():
+    """Two milliseconds are ten samples at 5 kHz: such a delay would make the loop unstable."""
     fast = replace(LOOP, sample_time=2e-4, delay=2e-4, counts_per_revolution=None)
     quick = {"time_constant": 0.01, "time_constant_product": 0.0}
     one = design(estimate(0.002, **quick), fast, together=False)
@@ -266,8 +266,8 @@ def test_a_fast_loop_must_tolerate_only_the_delay_it_can():
     assert one.reference.transition_time < 0.1
 
 
-def test_no_gain_margin_is_stated_beyond_the_band_of_the_record():
-    """Half a row of delay, that no record excludes, is all that such a crossing depends on."""
+def test_stated_gain_margin_is_capped_beyond_the_recorded_band():
+    """That phase crossing depends on half a row of delay, which no record excludes."""
     loop = replace(LOOP, sample_time=0.001, delay=None, counts_per_revolution=28.0)
     one = design(estimate(time_constant=0.03, time_constant_product=0.0), loop)
     band = one.specification.gain_margin

@@ -54,7 +54,7 @@ def sensitivity(one, omega):
     return np.abs(loop / (1 + loop))
 
 
-def test_the_loop_stays_within_the_excited_band():
+def test_loop_bandwidth_stays_within_the_excited_band():
     loop = replace(LOOP, difference_window=0)
     free, held = (design(known_up_to(f), loop) for f in (600.0, 5.0))
     omega = np.geomspace(10.0, 600.0, 100)
@@ -68,12 +68,12 @@ def test_the_loop_stays_within_the_excited_band():
 
 
 @pytest.mark.parametrize("method", sorted(METHODS))
-def test_every_method_stays_within_the_excited_band(method):
+def test_loop_bandwidth_of_every_method_stays_within_the_excited_band(method):
     held = design(known_up_to(20.0), replace(LOOP, difference_window=0), method)
     assert sensitivity(held, np.geomspace(50.0, 600.0, 100)).max() < 0.51
 
 
-def test_error_that_is_shown_counts_for_a_resonance():
+def test_significant_model_error_limits_the_loop_gain_at_its_frequency():
     # Of ten times the response, at one frequency: stable with every phase of it.
     bound = tuple(3.0 if f == 50.0 else 0.05 for f in FREQUENCY)
     shown = tuple(2.5 if b > 1 else 0.01 for b in bound)
@@ -81,7 +81,7 @@ def test_error_that_is_shown_counts_for_a_resonance():
     assert sensitivity(one, np.array([50.0]))[0] < 0.101
 
 
-def test_error_that_is_not_shown_does_not_count_in_full():
+def test_insignificant_model_error_is_capped_at_the_default_weight():
     bound = tuple(30.0 if f > 20 else 0.05 for f in FREQUENCY)
     weight = unmodelled_dynamics(estimate((0.01,) * len(FREQUENCY), bound)).weight
     assert weight(np.array([100.0])) == pytest.approx(2.0)
@@ -89,8 +89,8 @@ def test_error_that_is_not_shown_does_not_count_in_full():
     assert weight(np.array([5000.0])) == pytest.approx(2.0)
 
 
-def test_a_single_frequency_of_voltage_supports_slower_loops():
-    """A sine moves the motor nowhere below its frequency; integral action needs the gain there."""
+def test_unexcited_low_frequencies_do_not_limit_the_integral_gain():
+    """A sine does not excite below its frequency, where integral action needs the gain."""
     loop = replace(LOOP, difference_window=0)
     bound = tuple(50.0 if f < 10.0 else 0.05 for f in FREQUENCY)
     one = design(estimate(tuple(5.0 if b > 1 else 0.01 for b in bound), bound), loop)
@@ -103,7 +103,7 @@ def test_a_single_frequency_of_voltage_supports_slower_loops():
         design(estimate(shown, bound), loop)
 
 
-def test_recording_that_shows_nothing_is_refused_with_the_reason():
+def test_design_without_a_known_frequency_response_is_refused_with_the_reason():
     nothing = estimate((0.5,) * len(FREQUENCY), (5.0,) * len(FREQUENCY))
     with pytest.raises(DesignError, match=r"shows the motor's response up to 0\.5 rad/s"):
         design(nothing, LOOP)
@@ -128,7 +128,7 @@ def test_an_observer_tolerates_more_model_error_outside_its_feedback():
     assert np.abs(through)[1] < 0.5 * np.abs(plant.response(omega)[0])[1]
 
 
-def test_gain_of_unmodelled_dynamics_is_that_of_the_formula():
+def test_unmodelled_gain_is_the_peak_weighted_complementary_sensitivity():
     one, loop = known_up_to(20.0), replace(LOOP, difference_window=0)
     plant = sample(make_motors(one), loop)
     problem = Problem(plant, loop, {}, unmodelled_dynamics(one))
@@ -170,8 +170,8 @@ def end(y, T):
     return T * (np.flatnonzero(np.abs(y - 1) > 0.02)[-1] + 1)
 
 
-def test_the_effect_of_a_resonance_equals_that_of_a_simulated_one():
-    """Without feedback, of resonances from 20 rad/s on that nothing but their mass bounds."""
+def test_resonance_effect_matches_simulated_resonances():
+    """Open loop, with resonances from 20 rad/s of practically unbounded model error."""
     T = 0.002
     reference = minimum_jerk(T, 0.2, 2500)
     unknown = UnmodelledDynamics(np.array([20.0, 1000.0]), np.array([1e3, 1e3]))
@@ -188,7 +188,7 @@ def test_the_effect_of_a_resonance_equals_that_of_a_simulated_one():
 
 
 def looped(D, feedback, volts, T):
-    """Speed of a motor G (1 + D) in a loop that compares it with that of G; one step of delay."""
+    """Return the speeds of G, open loop, and of G (1 + D), tracking it one step late."""
     s = control.tf([1, 0], [1])
     G = 25.0 / (1e-4 * s**2 + 0.05 * s + 1)
     expected, real = (control.ss(control.sample_system(g, T, "zoh")) for g in (G, G * (1 + D)))
@@ -206,7 +206,7 @@ def looped(D, feedback, volts, T):
     return np.array(out).T
 
 
-def test_every_resonance_within_the_bound_stays_within_its_stated_effect():
+def test_resonances_within_the_error_bound_stay_within_the_stated_effect():
     loop, feedback = replace(LOOP, difference_window=0), Feedback(0.02, 0.3)
     T, s = loop.sample_time, control.tf([1, 0], [1])
     one = known_up_to(20.0)
@@ -232,7 +232,7 @@ def test_every_resonance_within_the_bound_stays_within_its_stated_effect():
     assert more < 0.5 * np.abs(turned @ np.diff(25.0 * volts))
 
 
-def test_nothing_is_added_where_all_is_known():
+def test_known_response_has_no_resonance_effect():
     plant, feedback = sample(make_motors(known_up_to(600.0)), LOOP), Feedback(0.02, 0.3)
     answer = minimum_jerk(0.005, 0.1, 100)
     assert compute_resonance_effect(None, plant, feedback, answer) == (0.0, 0.0)
@@ -240,7 +240,7 @@ def test_nothing_is_added_where_all_is_known():
     assert compute_resonance_effect(known, plant, feedback, answer)[0] < 0.01
 
 
-def test_bands_hold_a_resonance_that_the_recording_does_not_show():
+def test_bands_cover_an_undetected_resonance():
     loop = replace(LOOP, difference_window=0)
     least = design(known_up_to(600.0), loop).reference.transition_time
     free, held = (
@@ -250,7 +250,7 @@ def test_bands_hold_a_resonance_that_the_recording_does_not_show():
     assert held.settling.high > free.settling.high
 
 
-def test_a_change_is_no_quicker_than_what_is_known_lets_it_settle():
+def test_unknown_dynamics_lengthen_the_transition_time():
     loop = replace(LOOP, difference_window=0)
     known, unknown = (design(known_up_to(f), loop) for f in (600.0, 20.0))
     most = unknown.specification
@@ -262,7 +262,7 @@ def test_a_change_is_no_quicker_than_what_is_known_lets_it_settle():
     assert 1.1 * quicker.settling.high >= most.settling.high
 
 
-def test_band_is_what_99_percent_keep_on_either_side():
+def test_band_excludes_less_than_1_percent_on_either_side():
     figures = np.random.default_rng(1).permutation(np.arange(1.0, 301.0))
     found = band(150.0, figures)
     for beyond in (figures > found.high, figures < found.low):
@@ -278,7 +278,7 @@ def test_band_is_what_99_percent_keep_on_either_side():
     assert np.isnan(band(np.nan, figures).high)
 
 
-def test_settling_that_is_not_stated_is_said():
+def test_unstated_settling_time_is_reported():
     noisy = replace(LOOP, speed_noise=30.0)
     one = design(known_up_to(600.0), noisy, "ziegler_nichols")
     assert np.isnan(one.specification.settling.high)

@@ -13,14 +13,14 @@ from smp_motor_ident.report.document import identification_document, read_identi
 
 
 def lines(rng, n=600, error=0.0, noise=1.0):
-    """Independent lines of an output of 1 V/Hz, of its error, and of noise in that."""
+    """Return spectral lines: frequency, error with noise, and output of unit magnitude."""
     omega = np.linspace(1.0, 100.0, n)
     output = np.exp(2j * np.pi * rng.random(n))
     white = (rng.standard_normal(n) + 1j * rng.standard_normal(n)) / np.sqrt(2)
     return omega, error * output + noise * white, output
 
 
-def test_circle_holds_the_error_as_often_as_it_says():
+def test_confidence_circle_covers_the_error_at_its_stated_level():
     # Independent lines tell more than those of a window: the circle then holds it more often.
     inside = []
     for seed in range(200):
@@ -32,7 +32,7 @@ def test_circle_holds_the_error_as_often_as_it_says():
     assert np.mean(inside) > 0.95
 
 
-def test_circle_of_windowed_noise_holds_nothing_as_often_as_it_says():
+def test_confidence_circle_of_windowed_noise_covers_zero_at_its_stated_level():
     # Noise alone under a Hann window, whose neighbouring lines are correlated.
     inside, bands = 0, 0
     window = np.hanning(2002)[1:-1]
@@ -55,7 +55,7 @@ def test_bound_grows_where_the_output_is_small():
     assert bound[-1] > 5 * bound[0]
 
 
-def test_resonance_narrower_than_its_band_is_shown_by_its_peak():
+def test_resonance_narrower_than_its_band_is_detected_at_its_peak():
     # Its phase turns within the band, and its flanks lie on both sides of it.
     missed, found = 0, 0
     for seed in range(40):
@@ -72,7 +72,7 @@ def test_resonance_narrower_than_its_band_is_shown_by_its_peak():
     assert missed < 4
 
 
-def test_of_several_outputs_the_one_that_is_moved_least_tells():
+def test_model_error_is_judged_by_the_least_excited_output():
     rng = np.random.default_rng(3)
     omega, error, output = lines(rng, noise=0.1)
     faint = output / (1 + (omega / 10) ** 2)
@@ -114,7 +114,7 @@ def two_inertias_under_ramps(seed: int) -> tuple[Record, Callable[[np.ndarray], 
     return made, response
 
 
-def test_kinks_of_friction_under_ramps_do_not_pass_for_excitation():
+def test_friction_kinks_under_ramps_do_not_count_as_excitation():
     made, response = two_inertias_under_ramps(4)
     one = estimate(made)
     error, (gain, tau) = one.residuals.model_error, map(one.value, ("dc_gain", "time_constant"))
@@ -130,7 +130,7 @@ def test_kinks_of_friction_under_ramps_do_not_pass_for_excitation():
 
 
 def record(seed: int, resonance: float | None) -> Record:
-    """Speed of 20 rad/s/V, 50 ms; a resonance behind it; the exact response to held voltages."""
+    """Return a motor of 20 rad/s/V and 50 ms, optionally with a resonance, under held voltage."""
     rng, T, n, sub = np.random.default_rng(seed), 0.005, 6000, 20
     u = 6.0 * np.sign(rng.standard_normal(n // 6)).repeat(6)
     h, y, w, rate, shown = T / sub, 0.0, 0.0, 0.0, []
@@ -153,7 +153,7 @@ def plain():
     return estimate(record(1, None))
 
 
-def test_complete_model_is_known_and_nothing_is_shown(plain):
+def test_complete_model_has_no_significant_model_error(plain):
     error = plain.residuals.model_error
     frequency, shown, bound = map(np.array, (error.frequency, error.shown, error.bound))
     slow = frequency < 100.0
@@ -161,7 +161,7 @@ def test_complete_model_is_known_and_nothing_is_shown(plain):
     assert np.mean(shown[slow] > bound[slow] / 2) < 0.3
 
 
-def test_resonance_that_the_voltage_excites_is_shown():
+def test_excited_resonance_is_a_significant_model_error():
     error = estimate(record(2, 150.0), "first_order").residuals.model_error
     frequency, shown, bound = map(np.array, (error.frequency, error.shown, error.bound))
     near = np.argmin(np.abs(np.log(frequency / 150.0)))

@@ -31,7 +31,7 @@ def designed() -> Design:
 
 
 def drive(one, entry=ENTRY, load=0.0, late=0.0, wait=0.0, offset=0.0):
-    """Return a change of set-point that another motor did, as commission reads it."""
+    """Return the set-point change of a simulated motor, evaluated as by commission."""
     document = {"sample_time": STEP, "delay": STEP, "supply_voltage": 12.0}
     setpoint = one.specification.change / one.loop.gear_ratio
     run = simulate_closed_loop(
@@ -43,7 +43,7 @@ def drive(one, entry=ENTRY, load=0.0, late=0.0, wait=0.0, offset=0.0):
         drive=DriveSettings(command_timeout=math.inf, pwm_steps=1000),
         load=lambda t: load,
     )
-    # Zero is the first sample that saw the new set-point.
+    # Time zero is the first sample with the new set-point.
     instants = run.time - run.time[run.time >= REST][0]
     turn = entry.gearbox.to_wheel(entry.encoder.angle_per_count)
     even, speed = v.smooth_speed(instants, turn * run.count, STEP)
@@ -63,21 +63,21 @@ def drive(one, entry=ENTRY, load=0.0, late=0.0, wait=0.0, offset=0.0):
     )  # fmt: skip
 
 
-def test_a_wheel_that_does_as_designed_is_within_its_bands(designed):
+def test_nominal_wheel_is_within_its_bands(designed):
     change = drive(designed)
     assert v.judge([change]) == []
     # The prediction is the drive, but for the steps of the duty cycle.
     assert np.abs(change.nominal - change.speed).max() < 0.01 * change.setpoint
 
 
-def test_samples_that_come_late_are_in_the_prediction(designed):
-    # A computer that is busy elsewhere: intervals scatter by a third.
+def test_prediction_includes_sampling_jitter(designed):
+    # A busy computer: intervals jitter by 30 %.
     change = drive(designed, late=0.3 * STEP)
     assert v.judge([change]) == []
     assert np.abs(change.nominal - change.speed).max() < 0.02 * change.setpoint
 
 
-def test_samples_that_nobody_answered_are_in_the_prediction(designed):
+def test_prediction_includes_unanswered_samples(designed):
     loop = {"sample_time": STEP, "delay": STEP, "supply_voltage": 12.0}
     instants = STEP * np.arange(-60, 240)
     # 60 ms without an answer while the wheel gets faster: the voltage stays and is too large.
@@ -93,7 +93,7 @@ def test_samples_that_nobody_answered_are_in_the_prediction(designed):
     assert rows[1][-1] == pytest.approx(1.0, abs=0.02)
 
 
-def test_what_the_integral_keeps_from_one_change_to_the_next_is_in_the_prediction(designed):
+def test_prediction_includes_the_integral_left_by_the_previous_change(designed):
     # Friction of 2 V holds the wheel after each stop, so the integral stays.
     values = combinations_of(ENTRY.parameters) | {"static_voltage": 2.0}
     rubbing = MotorParameters.from_combinations(**values)
@@ -118,7 +118,7 @@ def test_what_the_integral_keeps_from_one_change_to_the_next_is_in_the_predictio
     assert np.abs(row - speed).max() < 0.02 * setpoint
 
 
-def test_how_long_a_command_waited_is_seen_in_the_voltages_that_were_applied():
+def test_arrival_delay_is_measured_from_the_applied_voltages():
     rng = np.random.default_rng(4)
     time = STEP * np.arange(200)
     commands, ages = rng.uniform(-10.0, 10.0, time.size), np.full(time.size, 0.001)
@@ -129,7 +129,7 @@ def test_how_long_a_command_waited_is_seen_in_the_voltages_that_were_applied():
     voltage = np.array([0.0] + [float(commands[k[0]]) if k.size else 0.0 for k in latest])
     loop = {"delay": 0.0, "supply_voltage": 12.0}
     delays = v.measure_arrival_delays((time, ages, commands), (time, voltage), loop)
-    # Before the first nothing was; the last two were not in effect when the record ended.
+    # The first command has no predecessor; the last two act after the end of the record.
     np.testing.assert_allclose(delays[1:-2], (arrived - time)[1:-2], atol=1e-9)
     measured = voltage + rng.normal(0.0, 1.0, voltage.size)
     said = v.measure_arrival_delays((time, ages, commands), (time, measured), loop)
@@ -140,8 +140,8 @@ def test_how_long_a_command_waited_is_seen_in_the_voltages_that_were_applied():
     assert np.array_equal(slower, np.full(time.size, STEP))
 
 
-def test_a_command_inside_the_dead_zone_of_a_driver_has_not_waited():
-    # It drives, brakes, creeps up inside a zone of 1.5 V, and drives on.
+def test_command_in_the_driver_dead_zone_is_not_measured_as_delayed():
+    # Drive, brake, a slow rise inside the dead zone of 1.5 V, drive.
     parts = (0.0, 60), (5.0, 100), (0.0, 1), (0.5, 100), (5.0, 100)
     commands = np.concatenate([np.full(lasts, volts) for volts, lasts in parts])
     commands += 1e-2 * np.arange(commands.size) * (commands != 0.0)
@@ -153,20 +153,20 @@ def test_a_command_inside_the_dead_zone_of_a_driver_has_not_waited():
     assert delays[1:].max() <= STEP + 1e-9
 
 
-def test_a_drive_that_its_computer_slowed_is_within_its_bands_and_says_so(designed):
+def test_excess_loop_delay_is_reported_and_included_in_the_bands(designed):
     slow = drive(designed, wait=0.03)
     assert slow.reading.overshoot > 10.0
     assert v.judge([slow]) == []
     (found,) = v.report_loop_delay([slow, drive(designed)])
     assert found.severity == "warning" and found.evidence["excess"] == slow.excess
     assert v.report_loop_delay([drive(designed)]) == []
-    # Where it is beyond even that, the computer is named, not the wheel.
+    # Beyond those bands the message blames the computer, not the wheel.
     (refused,) = v.judge([replace(slow, bands=replace(slow.bands, overshoot=1.0))])
     assert refused.advice == found.advice != v.judge([drive(designed, offset=-0.05)])[0].advice
 
 
 @pytest.mark.parametrize("gain", [0.6, 1.6])
-def test_another_motor_is_refused(designed, gain):
+def test_drive_of_a_different_motor_is_refused(designed, gain):
     motor = ENTRY.parameters
     other = replace(
         ENTRY,
@@ -179,25 +179,25 @@ def test_another_motor_is_refused(designed, gain):
     assert all(f.severity == "refused" and WHEEL in f.message for f in found)
 
 
-def test_a_speed_that_stays_off_is_refused(designed):
+def test_steady_state_speed_error_is_refused(designed):
     found = v.judge([drive(designed, offset=-0.05)])
     assert any("stays off" in f.message for f in found)
 
 
-def test_a_wheel_that_never_arrives_is_refused_in_words(designed):
+def test_blocked_wheel_that_never_settles_is_refused_with_a_message(designed):
     # Twice the torque of 12 V blocks the wheel.
     stall = 2.0 * ENTRY.gearbox.ratio * 12.0 * ENTRY.parameters.motor_constant
     found = v.judge([drive(designed, load=stall / ENTRY.parameters.resistance)])
     assert any("more than was recorded" in f.message for f in found)
 
 
-def test_a_drive_without_control_is_refused_with_its_reason():
+def test_silent_controller_is_refused_with_the_duration():
     assert v.report_silence(0.09) == []
     (found,) = v.report_silence(0.4)
     assert found.severity == "refused" and "0.40 s" in found.message and found.advice
 
 
-def test_the_resolution_of_a_speed_is_that_of_its_parabola():
+def test_speed_resolution_matches_the_scatter_of_the_smoothed_slope():
     # A staircase of counts from a slow wheel: the smoothed slope scatters as the formula says.
     quantum, speed = 0.01, 0.37
     time = np.arange(0.0, 20.0, STEP)

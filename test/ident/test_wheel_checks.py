@@ -26,7 +26,7 @@ LEVELS = (1.2, 2.4, 4.8)
 
 
 def trace(sign=1.0, velocity_scale=1.0, applied=1.0, dead=0.0, driven=True):
-    """Return a test of a motor of first order with friction: ramp, three levels, coast, both ways.
+    """Return the test of a first-order motor with friction: ramp, 3 levels, coast, both ways.
 
     The motor is integrated here, by Euler steps of a fiftieth of its time constant.
     """
@@ -72,7 +72,7 @@ def codes(*odd: Figures, hardware: Hardware = HARDWARE, **known: object) -> dict
     return {f.code: f.severity for f in found}
 
 
-def test_the_figures_are_those_of_the_motor():
+def test_check_figures_match_the_simulated_motor():
     # The speed of the last half of a hold has settled to exp(-5); counts resolve it to 0.1 %.
     assert GOOD.gain == pytest.approx(GAIN, rel=0.01)
     assert GOOD.friction == pytest.approx(FRICTION, abs=0.02)
@@ -85,21 +85,21 @@ def test_the_figures_are_those_of_the_motor():
     assert GOOD.rate == pytest.approx(1 / STEP) and GOOD.level == LEVELS[-1]
 
 
-def test_of_a_sound_robot_only_the_gear_ratio_is_left_open():
+def test_faultless_robot_has_only_a_note_on_the_gear_ratio():
     assert codes() == {"gear_ratio_unknown": "note"}
     names = [f"wheel_{k}" for k in range(3)]
     known = {"gains": dict.fromkeys(names, 25.5), "ratios": dict.fromkeys(names, RATIO)}
     assert codes(**known) == {}
 
 
-def test_feedback_that_comes_too_seldom_or_late_is_refused():
+def test_slow_or_delayed_feedback_is_refused():
     assert codes(replace(GOOD, rate=20.0))["feedback_rate"] == "refused"
     assert codes(replace(GOOD, age=0.5))["feedback_age"] == "refused"
     assert codes(replace(GOOD, age=-3600.0))["feedback_age"] == "refused"
     assert codes(replace(GOOD, repeated=7))["repeated_stamps"] == "warning"
 
 
-def test_a_trembling_encoder_is_no_motion_and_a_turning_wheel_is():
+def test_encoder_jitter_is_not_motion_and_a_turning_wheel_is():
     assert "motion_at_zero_voltage" not in codes(replace(GOOD, at_rest=2.0))
     assert codes(replace(GOOD, at_rest=40.0))["motion_at_zero_voltage"] == "refused"
     seen, phases = trace(driven=False)
@@ -115,9 +115,9 @@ def test_a_wheel_that_does_not_turn_is_refused_by_name():
     assert codes(still, moved={"wheel_0": {"wheel_0": 0.0}})["no_motion"] == "refused"
 
 
-def test_plugs_of_two_wheels_that_are_exchanged_are_separated_from_a_belt():
+def test_crossed_motor_plugs_are_separated_from_coupled_wheels():
     (seen, phases), (still, _) = trace(), trace(driven=False)
-    # Commands to the left turn the right.
+    # Commands to the left wheel turn the right one.
     moved = count_coupled_motion({"left": still, "right": seen}, phases)
     robot = Robot({"left": GOOD, "right": GOOD}, dict.fromkeys(("left", "right"), HARDWARE), moved)
     assert "crossed_wheels" in {f.code for f in judge(robot)}
@@ -138,7 +138,7 @@ def test_a_swapped_encoder_or_motor_is_refused_with_both_remedies():
     assert "channels" in found.advice and "leads" in found.advice
 
 
-def test_a_gear_ratio_that_counts_or_a_motor_file_contradict_is_refused():
+def test_gear_ratio_contradicting_counts_or_motor_file_is_refused():
     assert codes(shown(velocity_scale=0.75))["gear_ratio"] == "refused"
     assert codes(shown(velocity_scale=-1.0))["velocity_sign"] == "refused"
     assert codes(ratios={"wheel_0": 65.5})["gear_ratio"] == "refused"
@@ -154,7 +154,7 @@ def test_a_dead_zone_is_separated_from_friction():
     assert "dead_zone" not in codes()
 
 
-def test_a_weak_battery_is_refused_by_what_arrives_or_what_it_says():
+def test_low_supply_is_refused_by_applied_voltage_or_battery_report():
     weak = shown(applied=0.7)
     assert weak.applied == pytest.approx(0.7)
     # Friction and gain are of the voltage that arrives: the motor is the same.
@@ -166,7 +166,7 @@ def test_a_weak_battery_is_refused_by_what_arrives_or_what_it_says():
     assert codes(replace(GOOD, applied=0.0))["voltage_not_reported"] == "refused"
 
 
-def test_a_wheel_that_drags_is_separated_from_motors_that_scatter():
+def test_dragging_wheel_is_separated_from_normal_friction_scatter():
     assert codes(replace(GOOD, friction=5 * FRICTION))["friction_outlier"] == "refused"
     heavier = codes(replace(GOOD, coast=5 * GOOD.coast))
     assert heavier["coasts_longer"] == "warning" and "friction_outlier" not in heavier
@@ -180,13 +180,13 @@ def test_a_wheel_that_drags_is_separated_from_motors_that_scatter():
     assert "friction_outlier" not in {f.code for f in found}
 
 
-def test_the_voltage_grows_until_friction_is_a_tenth_and_counts_are_enough():
+def test_check_voltage_suffices_if_friction_is_a_tenth_and_counts_resolve_the_speed():
     assert responds_clearly(5.0, 0.5, 100.0)
     assert not responds_clearly(4.9, 0.5, 1000.0)
     assert not responds_clearly(5.0, 0.5, 99.0)
 
 
-def test_samples_that_wait_in_a_queue_show_the_same_motor():
+def test_queued_samples_give_the_same_check_figures():
     # A busy computer takes samples 0.2 s late: a phase begins with samples of the one before.
     seen, phases = trace()
     late = np.concatenate([np.full(40, seen.phase[0]), seen.phase[:-40]])
@@ -197,18 +197,18 @@ def test_samples_that_wait_in_a_queue_show_the_same_motor():
     assert found.friction == pytest.approx(FRICTION, abs=0.032 * LEVELS[0])
 
 
-def test_a_wheel_has_not_settled_while_samples_are_of_the_voltage_before():
+def test_wheel_has_not_settled_while_samples_belong_to_the_previous_voltage():
     seen, phases = trace()
     first, second = (seen.during(p.number) for p in phases if p.kind == "hold" and p.level > 2.0)
     assert has_settled(first)
     begun = Trace.of(np.concatenate([_rows(first), _rows(second)[:20]]))
     assert not has_settled(begun)
     assert has_settled(Trace.of(np.concatenate([_rows(first), _rows(second)])))
-    # As long as a computer is busy these are all that there are.
+    # A busy computer delivers only these samples.
     assert not has_settled(replace(first, command=second.command[: first.command.size]))
 
 
-def test_a_coast_begins_when_the_voltage_is_gone():
+def test_coast_time_is_unknown_while_voltage_is_still_applied():
     seen, phases = trace()
     late = seen.voltage.copy()
     for hold, coast in itertools.pairwise(phases):
@@ -218,8 +218,8 @@ def test_a_coast_begins_when_the_voltage_is_gone():
     assert math.isnan(figures(replace(seen, voltage=late), phases, HARDWARE).coast)
 
 
-def test_samples_that_come_in_bunches_settle_nothing():
-    # Half-way up an exponential of 0.4 s: of the last tenth of the time come most samples.
+def test_bunched_samples_do_not_count_as_settled():
+    # Half-way up an exponential of 0.4 s, most samples fall in the last tenth of the time.
     time = np.concatenate([np.linspace(0.0, 0.5, 6), np.linspace(0.5, 0.55, 40)[1:]])
     count = 1000.0 * (time - 0.4 * (1.0 - np.exp(-time / 0.4)))
     columns = [np.ones(time.size)] * 8
@@ -233,7 +233,7 @@ def _rows(part: Trace) -> np.ndarray:
     return np.stack([getattr(part, name) for name in names], axis=1)
 
 
-def test_a_position_without_use_for_odometry_is_a_warning_of_its_wheel():
+def test_position_unusable_for_odometry_is_a_warning():
     found = judge(Robot({}, {}, positions={"left": "its position wraps", "right": ""}))
     assert [(f.code, f.severity, f.message) for f in found] == [
         ("position_unusable", "warning", "left: its position wraps")

@@ -14,7 +14,7 @@ R, L, K, J, B, TC = 3.2, 2e-3, 0.03, 1.4e-5, 5.5e-5, 2e-3
 
 
 def signal(rise: float, seed: int, friction: float = TC) -> Record:
-    """Return six seconds of three tones that a motor follows whose resistance has risen."""
+    """Return 6 s of a motor with increased resistance under three tones."""
     rng = np.random.default_rng(seed)
     time = 5e-3 * np.arange(1200)
     volts = sum(2.0 * np.sin(2 * np.pi * f * time + f) for f in (0.3, 0.7, 2.9))
@@ -26,14 +26,14 @@ def signal(rise: float, seed: int, friction: float = TC) -> Record:
 
 @pytest.mark.parametrize("seed", range(5))
 @pytest.mark.parametrize("friction", [TC, 5 * TC])
-def test_the_resistance_of_a_recording_is_the_windings_whatever_the_friction(seed, friction):
+def test_winding_resistance_is_estimated_independent_of_friction(seed, friction):
     found = resistance(signal(0.1, seed, friction))
     assert found.value == pytest.approx(1.1 * R, abs=4 * found.std)
     assert found.std < 0.03 * R
 
 
 @pytest.mark.parametrize("rise", [0.3, 0.5])
-def test_a_winding_that_heats_ends_the_commissioning(rise):
+def test_heated_winding_stops_the_commissioning(rise):
     (finding,) = report_heated_winding("left", [signal(0.0, 1)], signal(rise, 2))
     assert finding.code == "winding_hot" and finding.severity == "refused"
     assert finding.evidence["warmer"] == pytest.approx(rise / 0.00393, rel=0.1)
@@ -41,17 +41,17 @@ def test_a_winding_that_heats_ends_the_commissioning(rise):
 
 
 @pytest.mark.parametrize("seed", range(20))
-def test_a_winding_that_warms_as_motors_do_does_not(seed):
+def test_normal_winding_warming_does_not_stop_the_commissioning(seed):
     assert not report_heated_winding("left", [signal(0.0, seed)], signal(0.1, 100 + seed))
 
 
-def test_without_a_current_nothing_is_known():
+def test_winding_resistance_is_unknown_without_current():
     bare = replace(signal(0.5, 1), current=None)
     assert resistance(bare) is None
     assert not report_heated_winding("left", [signal(0.0, 1)], bare)
 
 
-def test_segments_and_lost_samples_are_left_out():
+def test_winding_resistance_skips_segment_boundaries_and_lost_samples():
     record = signal(0.0, 3)
     current = record.current.copy()
     current[200:220] = np.nan
