@@ -12,7 +12,7 @@ from smp_motor_ident.quality.stamps import merge_bunches
 from smp_motor_ident.record import Record
 
 
-def bunched(size: int) -> Record:
+def make_bunched_record(size: int) -> Record:
     """Return a record with stamps equal to 1 ns in bunches, as from a coarse clock."""
     made = motors.record("rear_left", current=False, seconds=8.0)
     row = np.arange(len(made))
@@ -22,7 +22,7 @@ def bunched(size: int) -> Record:
 
 def test_equal_stamps_of_a_periodic_sensor_are_repaired_with_a_finding():
     plain = estimate(motors.record("rear_left", current=False, seconds=8.0))
-    found = estimate(bunched(4))
+    found = estimate(make_bunched_record(4))
     assert "arrival_beat" in [f.code for f in found.findings]
     # The beat is known to a twentieth of a sample: a hundredth of the lag that it is late by.
     assert found.value("dc_gain") == pytest.approx(plain.value("dc_gain"), rel=0.002)
@@ -30,13 +30,13 @@ def test_equal_stamps_of_a_periodic_sensor_are_repaired_with_a_finding():
 
 
 def test_merging_bunches_keeps_one_sample_per_stamp_with_a_warning():
-    merged = merge_bunches(bunched(4))
-    assert len(merged) == pytest.approx(len(bunched(4)) / 4, abs=1)
+    merged = merge_bunches(make_bunched_record(4))
+    assert len(merged) == pytest.approx(len(make_bunched_record(4)) / 4, abs=1)
     assert [f.severity for f in merged.findings if f.code == "stamps_equal"] == ["warning"]
 
 
 def test_merging_bunches_keeps_segment_start_times():
-    made = bunched(4)
+    made = make_bunched_record(4)
     made = replace(made, starts=(0, 401, 1203))
     merged = merge_bunches(made)
     assert [made.time[s] for s in made.starts] == pytest.approx(

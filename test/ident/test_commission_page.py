@@ -64,7 +64,7 @@ def passed(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def shown(browser: Browser, where: str) -> list[str]:
+def read_texts(browser: Browser, where: str) -> list[str]:
     """Return the texts of elements."""
     text = f"[...document.querySelectorAll({where!r})].map(e => e.innerText.trim())"
     found: list[str] = browser.value(text)
@@ -74,13 +74,15 @@ def shown(browser: Browser, where: str) -> list[str]:
 def test_page_shows_gains_then_yaml_then_verification_drive(passed, tmp_path):
     with Browser(tmp_path / "profile") as browser:
         browser.open(passed / "report.html", 1280)
-        assert shown(browser, "main h2") == [
+        assert read_texts(browser, "main h2") == [
             "Motors and gains", "Parameters of wheel_pid", "Verification drive",
             "Checks of the wheels",
         ]  # fmt: skip
-        assert shown(browser, ".verdict") == ["Passed. The wheels drove as designed."]
+        assert read_texts(browser, ".verdict") == ["Passed. The wheels drove as designed."]
         # The numbers are those of the JSON, each with the scatter of the records.
-        rows = {row.split("\t")[0]: row.split("\t")[1:] for row in shown(browser, "#results tr")}
+        rows = {
+            row.split("\t")[0]: row.split("\t")[1:] for row in read_texts(browser, "#results tr")
+        }
         assert rows["p V s/rad"] == ["2.675"] * 4 and rows["i V/rad"] == ["87.97"] * 4
         assert rows["DC gain rad/s/V"] == ["25.50 ± 0.10"] * 4
         # Systematic errors stand apart, all of them in the width of the page.
@@ -91,7 +93,7 @@ def test_page_shows_gains_then_yaml_then_verification_drive(passed, tmp_path):
         assert rows["Settles, designed ms"] == ["145, at most 150"] * 4
         assert rows["Settles, measured ms"] == ["149"] * 4
         # The button copies the parameter file.
-        (copied,) = shown(browser, "#gains pre")
+        (copied,) = read_texts(browser, "#gains pre")
         assert yaml.safe_load(copied) == yaml.safe_load((passed / "gains.yaml").read_text())
         # One chart per wheel shows the predicted and measured speed of both directions.
         charts: list[dict[str, Any]] = browser.value(

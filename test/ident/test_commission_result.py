@@ -71,7 +71,7 @@ def write(folder: Path, did: Record) -> None:
     write_bag(folder, Motion(WHEEL, stamps, *signals).messages(latency=0))
 
 
-def numbers(folder: Path) -> dict[str, Any]:
+def read_results(folder: Path) -> dict[str, Any]:
     """Return the results without dates and paths."""
     gains = json.loads((folder / "gains.json").read_text())
     return {
@@ -92,6 +92,6 @@ def test_resumed_commissioning_gives_bit_identical_results(tmp_path, monkeypatch
     while codes[-1] == 130 and len(codes) < 9:  # in the check, and in each of four signals
         codes.append(main([*cut, "--yes", "--resume"]))
     assert codes == [130] * 4 + [0]
-    whole, parts = numbers(tmp_path / "whole"), numbers(tmp_path / "cut")
+    whole, parts = read_results(tmp_path / "whole"), read_results(tmp_path / "cut")
     assert WHEEL in whole["identification"]
     assert parts == whole

@@ -18,7 +18,7 @@ GAIN, LAG, STEP, TURN = 40.0, 0.03, 0.001, 2 * np.pi / 48
 """rad/s/V, s, sampling interval [s] and a count [rad]: one count a sample is 131 of 480 rad/s."""
 
 
-def looped(samples: int = 8000, over: int = 1) -> Record:
+def simulate_closed_loop(samples: int = 8000, over: int = 1) -> Record:
     """Return a closed-loop record with speed from counts over one or several samples."""
     rng = np.random.default_rng(2)
     wanted = np.repeat(rng.uniform(-130.0, 130.0, samples // 200), 200)
@@ -40,7 +40,7 @@ def looped(samples: int = 8000, over: int = 1) -> Record:
 
 
 def test_closed_loop_estimate_from_differenced_counts_is_unbiased():
-    record = looped()
+    record = simulate_closed_loop()
     (summed,) = recover_counts([record])
     moved = np.diff(summed.position) / TURN
     np.testing.assert_allclose(moved, np.rint(moved), atol=1e-6)  # rounding of a sum of thousands
@@ -61,13 +61,14 @@ def test_counts_are_detected_in_the_speed_of_an_unmodelled_motor():
 
 
 def test_counts_are_not_recovered_from_speed_differenced_over_several_samples():
-    record = looped(over=4)
+    record = simulate_closed_loop(over=4)
     assert recover_counts([record])[0] is record and read_count_rounding(record) == 0.0
-    assert recover_counts([looped(), record])[1] is record  # also next to a recoverable record
+    # The same next to a recoverable record.
+    assert recover_counts([simulate_closed_loop(), record])[1] is record
 
 
 def test_counts_are_not_recovered_from_speed_with_lost_samples():
-    record = looped()
+    record = simulate_closed_loop()
     lost = np.delete(np.arange(len(record)), 500)
     gap = Record("motor", record.time[lost], record.voltage[lost], velocity=record.velocity[lost])
     assert recover_counts([gap])[0] is gap
@@ -81,7 +82,7 @@ PERIOD = 0.0115
 """Nominal loop period [s] by which the firmware divides; the real loop is jittered."""
 
 
-def late_loop(per_turn: float | None, nominal: bool) -> Record:
+def simulate_jittered_loop(per_turn: float | None, nominal: bool) -> Record:
     """Return speed from counts over the nominal period or over the true intervals."""
     rng = np.random.default_rng(7)
     interval = 0.01 + rng.exponential(0.001, 1500) + (rng.random(1500) < 0.01) * 0.03
@@ -100,21 +101,21 @@ def late_loop(per_turn: float | None, nominal: bool) -> Record:
 
 
 def test_speed_over_the_nominal_period_is_corrected_to_true_intervals():
-    put_right = correct_nominal_period(late_loop(48.0, nominal=True))
-    real = late_loop(48.0, nominal=False)
+    put_right = correct_nominal_period(simulate_jittered_loop(48.0, nominal=True))
+    real = simulate_jittered_loop(48.0, nominal=False)
     np.testing.assert_allclose(put_right.velocity[1:], real.velocity[1:], rtol=1e-9)
     assert correct_nominal_period(real) is real
-    check(estimate(late_loop(48.0, nominal=True)), {"dc_gain": GAIN}, most=0.005)
+    check(estimate(simulate_jittered_loop(48.0, nominal=True)), {"dc_gain": GAIN}, most=0.005)
 
 
 def test_unknown_nominal_period_makes_the_estimate_unreliable():
-    found = estimate(late_loop(None, nominal=True))
+    found = estimate(simulate_jittered_loop(None, nominal=True))
     (said,) = [f for f in found.findings if f.code == "nominal_period"]
     assert said.severity == "unreliable" and "counts_per_revolution" in said.advice
 
 
 def test_stamp_jitter_of_a_periodic_sensor_is_not_corrected_as_nominal_period():
-    record = late_loop(48.0, nominal=False)
+    record = simulate_jittered_loop(48.0, nominal=False)
     regular = PERIOD * np.arange(len(record))
     even = replace(record, time=regular, velocity=GAIN * record.voltage)
     late = np.random.default_rng(3).exponential(0.1 * PERIOD, len(record))

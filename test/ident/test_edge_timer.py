@@ -22,7 +22,7 @@ def steps(seconds: float = 15.0) -> np.ndarray:
     return np.repeat(levels, 40)[:rows]
 
 
-def motion(volts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def simulate_motion(volts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return speed and angle of a motor with friction on a fine grid."""
     rows = volts.size
     speed, w = np.zeros(rows * round(STEP / FINE)), 0.0
@@ -37,7 +37,9 @@ def motion(volts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return speed, np.cumsum(speed) * FINE
 
 
-def timed(speed: np.ndarray, angle: np.ndarray, tick: float, count: float = COUNT) -> np.ndarray:
+def read_edge_timer(
+    speed: np.ndarray, angle: np.ndarray, tick: float, count: float = COUNT
+) -> np.ndarray:
     """Return an edge timer's reading at each row; zero after a tenth of a second without edge."""
     edges = np.floor(angle / count + 0.3)
     at = np.flatnonzero(np.diff(edges)) + 1
@@ -51,18 +53,18 @@ def timed(speed: np.ndarray, angle: np.ndarray, tick: float, count: float = COUN
     return np.where(rows - instants[last] > 0.1, 0.0, said)
 
 
-def recorded(tick: float, per_turn: float | None) -> Record:
+def simulate_record(tick: float, per_turn: float | None) -> Record:
     volts = steps()
-    speed, angle = motion(volts)
+    speed, angle = simulate_motion(volts)
     hardware = Hardware(counts_per_revolution=per_turn)
-    shown = timed(speed, angle, tick)
+    shown = read_edge_timer(speed, angle, tick)
     time = STEP * np.arange(volts.size)
     return Record("motor", time, volts, velocity=shown, hardware=hardware)
 
 
 @pytest.mark.parametrize("tick, per_turn", [(1e-6, None), (4e-6, 48.0)])
 def test_held_edge_timer_readings_are_not_estimated_as_dead_zone(tick, per_turn):
-    record = recorded(tick, per_turn)
+    record = simulate_record(tick, per_turn)
     (said,) = [f for f in interpolate_edge_timing(record).findings if f.code == "edge_timer"]
     assert said.evidence["count"] == pytest.approx(COUNT, rel=0.25)  # by how it is held: to a row
     found = estimate(record)
@@ -72,7 +74,7 @@ def test_held_edge_timer_readings_are_not_estimated_as_dead_zone(tick, per_turn)
 
 def test_rounded_or_held_speed_is_not_detected_as_edge_timed():
     volts = steps()
-    speed, angle = motion(volts)
+    speed, angle = simulate_motion(volts)
     every = round(STEP / FINE)
     counts = np.floor(angle[every - 1 :: every] / COUNT)
     time = STEP * np.arange(volts.size)
@@ -106,8 +108,8 @@ def test_exponential_decay_of_a_filter_is_not_detected_as_edge_timed():
 def test_friction_is_estimated_from_edge_timer_speed_under_fast_reversals(per_turn):
     """Near zero speed a reading is up to two rows late; elsewhere nearly not at all."""
     volts = np.repeat(np.tile([3.0, -3.0], 25), 60)
-    speed, angle = motion(volts)
-    shown = timed(speed, angle, 1e-6, 2 * np.pi / per_turn)
+    speed, angle = simulate_motion(volts)
+    shown = read_edge_timer(speed, angle, 1e-6, 2 * np.pi / per_turn)
     hardware = Hardware(counts_per_revolution=float(per_turn))
     record = Record("motor", STEP * np.arange(volts.size), volts, velocity=shown, hardware=hardware)
     true = speed[round(STEP / FINE) - 1 :: round(STEP / FINE)]

@@ -53,7 +53,7 @@ COMMAND_RATE = 200.0
 FINER = 20  # steps of the driver's clock to a sample
 
 
-def jittered(latest: float, seed: int) -> Record:
+def simulate_command_jitter(latest: float, seed: int) -> Record:
     """Return random steps, each delayed by a random time of up to ``latest`` samples."""
     rng = np.random.default_rng(seed)
     asked = np.repeat(rng.uniform(-10.0, 10.0, 200), 10)
@@ -70,13 +70,13 @@ def jittered(latest: float, seed: int) -> Record:
 
 
 def test_command_jitter_is_covered_by_the_total_uncertainty():
-    for found in (estimate(jittered(1.0, seed)) for seed in range(3)):
+    for found in (estimate(simulate_command_jitter(1.0, seed)) for seed in range(3)):
         names = ("dc_gain", "time_constant", "time_constant_product")
         motors.check(found, motors.truth("rear_left", 0.0), names, sigmas=3.5, total=True)
 
 
 def test_fixed_delay_is_kept_under_command_jitter():
-    found = estimate(jittered(1.0, 0), fixed={"delay": 0.5 / COMMAND_RATE})
+    found = estimate(simulate_command_jitter(1.0, 0), fixed={"delay": 0.5 / COMMAND_RATE})
     assert found.combinations["delay"].value == 0.5 / COMMAND_RATE
     truth = motors.truth("rear_left", 0.0)
     motors.check(found, truth, ["time_constant"], sigmas=3.5, total=True)
@@ -86,7 +86,7 @@ RATE, SECONDS, WINDOW, STATIC = 500, 16, 10, 0.4
 R, L, K, J, B = TABLE_1["rear_left"]
 
 
-def loaded(load, *, counts, seed, least=-9.0, back=SECONDS):
+def simulate_load(load, *, counts, seed, least=-9.0, back=SECONDS):
     """Return a record under a load relative to friction, with averaged speed or counts.
 
     The voltage is reversed from ``back`` [s] on.
@@ -107,14 +107,14 @@ def loaded(load, *, counts, seed, least=-9.0, back=SECONDS):
     return Record("motor", time, voltage, current=current, velocity=speed)
 
 
-def stepped(at: float) -> np.ndarray:
+def make_load_step(at: float) -> np.ndarray:
     return np.where(np.arange(RATE * SECONDS) < at * RATE, 0.0, 0.7)
 
 
 @pytest.mark.parametrize("at", [4.1, 9.3])
 @pytest.mark.parametrize("counts", [False, True])
 def test_step_load_is_found_without_parameter_bias(counts, at):
-    found = estimate(loaded(stepped(at), counts=counts, seed=3))
+    found = estimate(simulate_load(make_load_step(at), counts=counts, seed=3))
     (words,) = [f for f in found.findings if f.code == "load_step"]
     assert abs(words.evidence["load_step_at"] * SECONDS - at) < 0.06 * SECONDS
     true = motors.truth("rear_left", STATIC)
@@ -126,18 +126,22 @@ def test_step_load_is_found_without_parameter_bias(counts, at):
 @pytest.mark.parametrize(("counts", "back"), [(False, SECONDS), (True, SECONDS), (True, 9.4)])
 def test_step_load_does_not_bias_the_gain_of_a_motor_turning_one_way(counts, back):
     """Driven in one direction throughout, or reversed shortly after the load step."""
-    found = estimate(loaded(stepped(9.3), counts=counts, seed=5, least=3.0, back=back))
+    found = estimate(
+        simulate_load(make_load_step(9.3), counts=counts, seed=5, least=3.0, back=back)
+    )
     motors.check(found, motors.truth("rear_left", STATIC), ["dc_gain"], floor=2e-3)
 
 
 def test_load_step_is_not_reported_without_a_load():
-    found = estimate(loaded(np.zeros(RATE * SECONDS), counts=False, seed=4))
+    found = estimate(simulate_load(np.zeros(RATE * SECONDS), counts=False, seed=4))
     assert "load_step" not in {f.code for f in found.findings}
 
 
 @pytest.mark.parametrize("seed", range(3))
 def test_torque_noise_is_not_reported_as_a_load_step(seed):
     rng = np.random.default_rng(20 + seed)
-    found = estimate(loaded(3.0 * rng.standard_normal(RATE * SECONDS), counts=True, seed=seed))
+    found = estimate(
+        simulate_load(3.0 * rng.standard_normal(RATE * SECONDS), counts=True, seed=seed)
+    )
     codes = {f.code for f in found.findings}
     assert "torque_noise" in codes and "load_step" not in codes

@@ -20,35 +20,35 @@ def page(name: str) -> str:
     return path.read_text(encoding="utf-8")
 
 
-def fences(text: str, language: str) -> list[str]:
+def find_fences(text: str, language: str) -> list[str]:
     return re.findall(rf"^```{language}\n(.*?)^```$", text, re.DOTALL | re.MULTILINE)
 
 
-def names_in(file: str) -> set[str]:
+def find_definitions(file: str) -> set[str]:
     """Return the functions, methods and classes that a file defines."""
     tree = ast.parse((ROOT / "smp_motor_ident" / file).read_text(encoding="utf-8"))
     kinds = (ast.FunctionDef, ast.AsyncFunctionDef, ast.ClassDef)
     return {node.name for node in ast.walk(tree) if isinstance(node, kinds)}
 
 
-def drawn() -> list[tuple[str, str]]:
+def read_drawn_functions() -> list[tuple[str, str]]:
     """Return functions and files of the drawings, in their order."""
-    lines = "".join(fences(page("record.md"), "text")).splitlines()
+    lines = "".join(find_fences(page("record.md"), "text")).splitlines()
     rows = [re.search(r"([a-zA-Z_, ]+?) {2,}([\w/]+\.py)", line) for line in lines]
     return [(name, row[2]) for row in rows if row for name in row[1].strip().split(", ")]
 
 
 def test_every_function_of_the_drawings_is_in_its_file():
-    assert len(drawn()) > 50
-    for name, file in drawn():
-        assert name in names_in(file), f"{file} has no {name}"
+    assert len(read_drawn_functions()) > 50
+    for name, file in read_drawn_functions():
+        assert name in find_definitions(file), f"{file} has no {name}"
 
 
 def test_types_of_the_page_are_in_their_files():
     rows = re.findall(r"^\| `(\w+)` \| `([\w/]+\.py)` \|", page("record.md"), re.MULTILINE)
     assert len(rows) == 11
     for name, file in rows:
-        assert name in names_in(file), f"{file} has no {name}"
+        assert name in find_definitions(file), f"{file} has no {name}"
 
 
 def test_functions_are_drawn_in_the_order_in_which_they_are_called():
@@ -63,7 +63,7 @@ def test_functions_are_drawn_in_the_order_in_which_they_are_called():
     ]  # fmt: skip
     called = [body.index(f"{name}(") for name in order]
     assert called == sorted(called)
-    names = [name for name, _ in drawn()]
+    names = [name for name, _ in read_drawn_functions()]
     drawn_at = [names.index(name) for name in order]
     assert drawn_at == sorted(drawn_at)
 
@@ -79,8 +79,8 @@ def test_table_of_effects_lists_the_whole_catalogue():
 
 def test_example_program_prints_the_documented_output(capsys):
     text = page("identification.md")
-    (program,) = fences(text, "python")
-    (printed,) = fences(text, "text")
+    (program,) = find_fences(text, "python")
+    (printed,) = find_fences(text, "text")
     shown = printed.splitlines()
     exec(compile(program, "identification", "exec"), {})
     fresh = capsys.readouterr().out.splitlines()

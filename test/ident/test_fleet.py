@@ -64,7 +64,7 @@ def test_outlier_motor_is_found_only_with_enough_robots():
     assert "other" in page([*same, *other], outliers([*same, *other]))
 
 
-def fake(path: str, settings: tuple[Any, ...]) -> list[Row]:
+def identify_fake(path: str, settings: tuple[Any, ...]) -> list[Row]:
     """Identify a fake recording: broken, killing its worker once, or valid."""
     with (Path(path).parent / "log").open("a") as log:
         log.write(Path(path).name + "\n")
@@ -79,7 +79,7 @@ def fake(path: str, settings: tuple[Any, ...]) -> list[Row]:
 
 
 def test_a_broken_bag_and_a_killed_worker_lose_no_other_result(tmp_path, monkeypatch):
-    monkeypatch.setattr(command, "identify_one", fake)
+    monkeypatch.setattr(command, "identify_one", identify_fake)
     folder = tmp_path / "robot7"
     folder.mkdir()
     bags = [folder / f"{name}.csv" for name in ("broken", "deadly", "fine", "good")]

@@ -13,7 +13,7 @@ GAIN, TAU, STEP = 25.0, 0.06, 0.01
 ROWS = 3_000
 
 
-def recorded(seed: int, noise: float = 0.3, hold: int = 25, tau: float = TAU) -> Record:
+def simulate_record(seed: int, noise: float = 0.3, hold: int = 25, tau: float = TAU) -> Record:
     """Return the speed of a linear motor of first order under random levels of voltage."""
     rng = np.random.default_rng(seed)
     voltage = np.repeat(rng.uniform(-10.0, 10.0, ROWS // hold), hold)
@@ -21,7 +21,7 @@ def recorded(seed: int, noise: float = 0.3, hold: int = 25, tau: float = TAU) ->
     return Record("motor", STEP * np.arange(ROWS), voltage, velocity=speed)
 
 
-def glitched(record: Record, share: float, size: float, seed: int = 0) -> Record:
+def add_glitches(record: Record, share: float, size: float, seed: int = 0) -> Record:
     rng = np.random.default_rng(seed)
     wrong = rng.random(len(record)) < share
     speed = np.where(wrong, size * rng.uniform(-1.0, 1.0, len(record)), record.velocity)
@@ -31,7 +31,7 @@ def glitched(record: Record, share: float, size: float, seed: int = 0) -> Record
 @pytest.mark.parametrize(("share", "size"), [(0.001, 700.0), (0.005, 700.0), (0.02, 1e4)])
 @pytest.mark.parametrize("seed", range(2))
 def test_glitches_are_reported_and_do_not_bias_the_estimate(seed, share, size):
-    found = estimate(glitched(recorded(seed), share, size, seed))
+    found = estimate(add_glitches(simulate_record(seed), share, size, seed))
     (words,) = [f for f in found.findings if f.code == "glitches"]
     assert words.severity == "warning" and words.evidence["signal"] == "velocity"
     assert not found.unreliable
@@ -46,13 +46,13 @@ def test_glitches_are_reported_and_do_not_bias_the_estimate(seed, share, size):
 )
 @pytest.mark.parametrize("seed", range(5))
 def test_noise_and_fast_motion_are_not_glitches(seed, kind):
-    record = recorded(seed, **kind)
+    record = simulate_record(seed, **kind)
     assert remove_glitches(record) is record
 
 
 @pytest.mark.parametrize("quantum", [0.1, 2.0, 20.0])
 def test_quantised_speed_has_no_glitches(quantum):
-    record = recorded(3)
+    record = simulate_record(3)
     coarse = Record(
         "motor", record.time, record.voltage,
         velocity=quantum * np.round(record.velocity / quantum),
@@ -69,7 +69,7 @@ def test_the_response_to_a_short_pulse_is_not_a_glitch():
 
 
 def test_consecutive_glitches_of_an_angle_are_removed():
-    record = recorded(1)
+    record = simulate_record(1)
     angle = np.cumsum(record.velocity) * STEP
     wrong = angle.copy()
     wrong[500], wrong[900:903], wrong[1500] = 900.0, (-700.0, 800.0, 650.0), 0.0
@@ -80,13 +80,13 @@ def test_consecutive_glitches_of_an_angle_are_removed():
 
 
 def test_frequent_outliers_are_not_removed_as_glitches():
-    record = glitched(recorded(2), 0.15, 700.0)
+    record = add_glitches(simulate_record(2), 0.15, 700.0)
     assert remove_glitches(record) is record
 
 
 @pytest.mark.parametrize("lost", [0, 150])
 def test_lost_readings_are_reported_in_addition_to_glitches(lost):
-    record = glitched(recorded(1), 0.005, 700.0)
+    record = add_glitches(simulate_record(1), 0.005, 700.0)
     speed = record.velocity.copy()
     speed[1_000 : 1_000 + lost] = np.nan
     found = estimate(Record("motor", record.time, record.voltage, velocity=speed)).findings

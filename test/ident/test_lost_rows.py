@@ -14,7 +14,7 @@ from smp_motor_ident.record import Record
 GAIN, LAG, FRICTION, RATE = 60.0, 0.014, 1.0, 500.0
 
 
-def ramps(lost: float, seed: int = 0) -> Record:
+def simulate_ramps(lost: float, seed: int = 0) -> Record:
     """A motor of first order under a triangle of 7 V, solved in a hundredth of a sample."""
     rng = np.random.default_rng(seed)
     n, fine = 1700, 100
@@ -35,7 +35,7 @@ def ramps(lost: float, seed: int = 0) -> Record:
 
 @pytest.mark.parametrize("seed", range(3))
 def test_varying_command_is_interpolated_over_lost_rows(seed):
-    found = estimate(ramps(0.1, seed))
+    found = estimate(simulate_ramps(0.1, seed))
     lag = found.combinations["time_constant"]
     # 5 standard deviations count as a silent error; a command held over the gap would come
     # a tenth of a sample early on average, and as straight lines half a sample: 1 ms.
@@ -62,9 +62,11 @@ def test_segment_at_another_rate_has_no_lost_rows(begin):
 
 
 def test_complete_or_already_interpolated_records_are_unchanged():
-    whole = ramps(0.0)
+    whole = simulate_ramps(0.0)
     assert interpolate_lost_voltage(whole) is whole
-    noted = replace(ramps(0.1), findings=(Finding("samples_missing", "note", "by the reader"),))
+    noted = replace(
+        simulate_ramps(0.1), findings=(Finding("samples_missing", "note", "by the reader"),)
+    )
     assert interpolate_lost_voltage(noted) is noted
     jittered = replace(whole, time=whole.time + 0.3 / RATE * np.sin(np.arange(len(whole))))
     assert interpolate_lost_voltage(jittered) is jittered

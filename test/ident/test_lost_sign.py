@@ -11,20 +11,20 @@ from smp_motor_ident.errors import SignalError
 from smp_motor_ident.estimate import estimate
 
 
-def driven(kinds=("square", "fourier")):
+def make_record(kinds=("square", "fourier")):
     return motors.record("rear_left", current=False, kinds=kinds)
 
 
 @pytest.mark.parametrize("kind", ["sine", "square", "fourier"])
 def test_a_command_without_its_sign_is_refused_by_name(kind):
-    record = driven((kind,))
+    record = make_record((kind,))
     with pytest.raises(SignalError, match="no sign; map its direction"):
         estimate(replace(record, voltage=np.abs(record.voltage)))
 
 
 @pytest.mark.parametrize("kind", ["sine", "square", "fourier"])
 def test_a_speed_without_its_sign_is_refused_by_name(kind):
-    record = driven((kind,))
+    record = make_record((kind,))
     size = replace(record, velocity=np.abs(record.velocity), count=None)
     with pytest.raises(SignalError, match="velocity is never negative"):
         estimate(size)
@@ -58,14 +58,14 @@ def test_noise_at_rest_is_not_backward_motion(speed):
 
 @pytest.mark.parametrize("full", [100, 255, 1023])
 def test_duty_cycle_counts_mapped_as_voltage_are_reported(full):
-    record = driven()
+    record = make_record()
     counts = np.rint(record.voltage / 10.0 * full)
     codes = [f.code for f in estimate(replace(record, voltage=counts)).findings]
     assert "whole_volts" in codes
 
 
 def test_voltage_in_whole_volts_is_not_reported():
-    record = driven()
+    record = make_record()
     volts = [f.code for f in estimate(replace(record, voltage=np.rint(record.voltage))).findings]
     assert "whole_volts" not in volts
 
@@ -74,14 +74,14 @@ def test_voltage_in_whole_volts_is_not_reported():
     ("scale", "severity"), [(1.0, None), (20.3, "warning"), (300.7, "unreliable")]
 )
 def test_implausibly_high_voltage_is_reported(scale, severity):
-    record = driven()
+    record = make_record()
     found = estimate(replace(record, voltage=scale * record.voltage)).findings
     said = [f.severity for f in found if f.code == "high_voltage"]
     assert said == ([severity] if severity else [])
 
 
 def test_counts_without_counts_per_revolution_are_refused():
-    record = driven()
+    record = make_record()
     bare = replace(record, velocity=None, hardware=replace(record.hardware,
                                                            counts_per_revolution=None))  # fmt: skip
     with pytest.raises(SignalError, match="map counts_per_revolution"):

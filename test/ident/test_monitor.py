@@ -54,7 +54,7 @@ class Motor:
         ]
 
 
-def driving(seconds: float, rng: np.random.Generator) -> Iterator[float]:
+def generate_commands(seconds: float, rng: np.random.Generator) -> Iterator[float]:
     """Yield a joystick-like command: ramps to levels held for some seconds."""
     volts, target, left = 0.0, 0.0, 0.0
     for _ in range(round(seconds / STEP)):
@@ -66,24 +66,24 @@ def driving(seconds: float, rng: np.random.Generator) -> Iterator[float]:
         yield volts
 
 
-def followed(seconds, change=lambda motor, time: False, bad_day=False, seed=1):
+def simulate_monitor(seconds, change=lambda motor, time: False, disturbed=False, seed=1):
     """Drive, and yield the time and the monitor every second."""
     rng = np.random.default_rng(seed)
     monitor, motor, count = Monitor(MOTOR), Motor(), 0
     held_until = lost_until = -1.0
     noise = rng.normal(0, 5e-3, round(seconds / STEP) + 1)
-    for n, volts in enumerate(driving(seconds, rng)):
+    for n, volts in enumerate(generate_commands(seconds, rng)):
         time = n * STEP
         load = 0.0
         if n % 100 == 0:
             yield time, monitor
             if change(motor, time):
                 motor.change()
-            if bad_day and rng.random() < 0.02:
+            if disturbed and rng.random() < 0.02:
                 held_until = time + rng.uniform(0.2, 1.5)
-            if bad_day and rng.random() < 0.03:
+            if disturbed and rng.random() < 0.03:
                 lost_until = time + rng.uniform(0.05, 3.0)
-        if bad_day:
+        if disturbed:
             # The battery sags under current and over the day; a slope comes and goes.
             volts *= (1.0 - 0.15 * time / seconds) * (1 - 0.1 * abs(motor.state[0]))
             load = 0.5 * MOTOR.coulomb_friction * math.sin(2 * math.pi * time / 97)
@@ -91,7 +91,7 @@ def followed(seconds, change=lambda motor, time: False, bad_day=False, seed=1):
         counted = math.floor(motor.state[2] / COUNT)
         turned, count = (counted - count) * COUNT, counted
         current = motor.state[0] + float(noise[n])
-        if bad_day and rng.random() < 1e-4:
+        if disturbed and rng.random() < 1e-4:
             current += 3.0
         if time >= lost_until:
             monitor.add(1e9 + time + STEP, volts, current, turned)
@@ -119,7 +119,7 @@ def test_heated_winding_is_reported_within_20_s_of_leaving_its_band():
 
     left = 30 + 60 * 0.15 / 0.2
     flagged = None
-    for time, monitor in followed(120.0, heat):
+    for time, monitor in simulate_monitor(120.0, heat):
         if "winding_hot" in codes(monitor):
             flagged = flagged or time
         assert "magnet_weak" not in codes(monitor)
@@ -135,7 +135,7 @@ def test_weakened_magnet_is_reported_without_a_heat_alarm():
         motor.constant = MOTOR.motor_constant * (1 - 0.05 * min(max(time - 30, 0) / 60, 1))
         return 30 <= time <= 91
 
-    for _, monitor in followed(300.0, weaken):
+    for _, monitor in simulate_monitor(300.0, weaken):
         assert codes(monitor) <= {"magnet_weak"}
     assert codes(monitor) == {"magnet_weak"}
 
@@ -145,13 +145,13 @@ def test_tripled_friction_is_reported_without_heat_or_magnet_alarm():
         motor.friction = 3.0 if time >= 30 else 1.0
         return time == 30
 
-    for _, monitor in followed(120.0, drag):
+    for _, monitor in simulate_monitor(120.0, drag):
         assert codes(monitor) <= {"friction_high"}
     assert codes(monitor) == {"friction_high"}
 
 
 def test_half_an_hour_of_disturbed_driving_raises_no_alarm():
-    for time, monitor in followed(1800.0, bad_day=True):
+    for time, monitor in simulate_monitor(1800.0, disturbed=True):
         assert not codes(monitor), time
     assert {state for state, _ in monitor.validity().values()} == {"estimated"}
 
@@ -173,7 +173,7 @@ def test_invalid_commissioned_values_are_refused_by_name():
 
 
 def test_history_is_read_without_its_truncated_last_line(tmp_path):
-    *_, (_, monitor) = followed(60.0)
+    *_, (_, monitor) = simulate_monitor(60.0)
     file = tmp_path / "history.jsonl"
     entries = [history.entry_of(1e9 + 3600.0 * k, "front_left", monitor) for k in range(3)]
     history.append(file, entries[:2])

@@ -137,7 +137,7 @@ def test_angle_noise_at_rest_is_not_detected_as_motion():
     assert abs(found.value - truth.value) < 3 * found.std
 
 
-def staircase(lag: float, scatter: float) -> Record:
+def make_staircase_record(lag: float, scatter: float) -> Record:
     """Return a speed at 1 Hz of a motor of gain 20 with friction of 0.5 V under 30 levels."""
     rng = np.random.default_rng(4)
     voltage = np.repeat(rng.uniform(-10.0, 10.0, 30), 10)
@@ -149,11 +149,11 @@ def staircase(lag: float, scatter: float) -> Record:
 
 
 def test_gain_is_estimated_if_the_lag_is_below_the_sampling_interval():
-    found = estimate(staircase(0.05, 5.0))
+    found = estimate(make_staircase_record(0.05, 5.0))
     lag, gain = (found.combinations[n] for n in ("time_constant", "dc_gain"))
     assert abs(lag.value - 0.05) < 2 * lag.total_std and lag.total_std > 0.05
     assert abs(gain.value - 20.0) < 3 * gain.std < 1.0
-    assert estimate(staircase(1.0, 5.0)).combinations["time_constant"].value is not None
+    assert estimate(make_staircase_record(1.0, 5.0)).combinations["time_constant"].value is not None
 
 
 def test_angle_mapped_as_velocity_is_refused_with_advice():
@@ -256,7 +256,7 @@ TIME = np.arange(int(6 * RATE)) / RATE
 CHIRP = 10.0 * np.sin(2 * np.pi * (0.3 * TIME + 6.0 * TIME**2))  # to 72 Hz: a small swing at last
 
 
-def weaker(volts: np.ndarray, share: float, rate: float) -> Record:
+def make_weakened_record(volts: np.ndarray, share: float, rate: float) -> Record:
     """Return counts of a motor whose voltage is scaled by ``share`` in the last 30 %."""
     late = np.arange(volts.size) >= 0.7 * volts.size
     given = np.where(late, share * volts, volts)
@@ -267,44 +267,53 @@ def weaker(volts: np.ndarray, share: float, rate: float) -> Record:
 @pytest.mark.parametrize("share", [1.0, 0.7])
 def test_validation_accounts_for_the_sensor_resolution(share):
     if share == 1.0:  # a tail of a few counts is predicted to a count
-        found = estimate(weaker(CHIRP, 1.0, RATE))
+        found = estimate(make_weakened_record(CHIRP, 1.0, RATE))
     else:
         volts = motors.independent.excitation(np.arange(2000) / 200.0, "square", 10.0)
-        found = estimate(weaker(volts, share, 200.0))
+        found = estimate(make_weakened_record(volts, share, 200.0))
     codes = {f.code: f.severity for f in found.findings}
     assert ("validation" in codes or "supply_drift" in codes) == (share < 1.0)
 
 
-def counted(counts: list[int], starts: tuple[int, ...] = (0,)) -> Record:
+def make_count_record(counts: list[int], starts: tuple[int, ...] = (0,)) -> Record:
     count = np.array(counts)
     time = 0.01 * np.arange(count.size)
     hardware = Hardware(1.0, 500.0)
     return Record("w", time, np.ones(count.size), count=count, starts=starts, hardware=hardware)
 
 
-def kept(record: Record) -> list[int]:
+def find_kept_samples(record: Record) -> list[int]:
     """Return the indices at which the angle is an output."""
     return [int(k) for k in np.flatnonzero(np.isfinite(prepare([record], False).motion))]
 
 
 def test_only_the_middle_sample_of_a_standstill_is_kept():
     moving, still = list(range(20)), [20] * 31
-    assert kept(counted([*moving, *still, *range(21, 30)])) == [*range(20), 35, *range(51, 60)]
+    assert find_kept_samples(make_count_record([*moving, *still, *range(21, 30)])) == [
+        *range(20),
+        35,
+        *range(51, 60),
+    ]
 
 
 def test_a_segment_that_begins_at_rest_keeps_its_first_sample():
     counts = [0] * 30 + list(range(1, 11)) + [7] * 30 + list(range(8, 12))
-    assert kept(counted(counts, (0, 40))) == [0, *range(30, 40), 40, *range(70, 74)]
+    assert find_kept_samples(make_count_record(counts, (0, 40))) == [
+        0,
+        *range(30, 40),
+        40,
+        *range(70, 74),
+    ]
 
 
 def test_slow_motion_keeps_all_samples():
     slow = [k // (MIN_REST_SAMPLES - 1) for k in range(90)]
-    assert kept(counted(slow)) == list(range(90))
+    assert find_kept_samples(make_count_record(slow)) == list(range(90))
 
 
 @pytest.mark.parametrize("rest", [MIN_REST_SAMPLES, 10 * MIN_REST_SAMPLES])
 def test_duration_of_a_standstill_does_not_add_samples(rest):
-    assert len(kept(counted([0, 1, 2, *[3] * rest, 4, 5]))) == 6
+    assert len(find_kept_samples(make_count_record([0, 1, 2, *[3] * rest, 4, 5]))) == 6
 
 
 def test_a_motor_at_rest_with_a_noisy_angle_is_refused_despite_its_current():

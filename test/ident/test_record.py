@@ -8,14 +8,14 @@ from smp_motor_ident.errors import SignalError
 from smp_motor_ident.record import Record
 
 
-def a_record(**changes):
+def make_record(**changes):
     time = np.arange(6) * 0.01
     signals = {"wheel": "front_left", "time": time, "voltage": np.ones(6), "velocity": time * 3}
     return Record(**{**signals, **changes})
 
 
 def test_duration_and_sample_time_come_from_the_time_axis():
-    record = a_record()
+    record = make_record()
     assert len(record) == 6
     # Sums of 0.01 in floating point: exact to a few units in the last place.
     assert record.duration == pytest.approx(0.05, rel=1e-12)
@@ -23,7 +23,7 @@ def test_duration_and_sample_time_come_from_the_time_axis():
 
 
 def test_signals_are_kept_contiguous_and_as_float():
-    record = a_record(velocity=np.arange(12)[::2])
+    record = make_record(velocity=np.arange(12)[::2])
     assert record.velocity.dtype == np.float64
     assert record.velocity.flags["C_CONTIGUOUS"]
 
@@ -43,21 +43,21 @@ def test_signals_are_kept_contiguous_and_as_float():
 )
 def test_contradictory_signals_are_refused_by_name(changes, named):
     with pytest.raises(SignalError, match=named):
-        a_record(source="bench.mcap", **changes)
+        make_record(source="bench.mcap", **changes)
 
 
 @pytest.mark.parametrize("name", ["current", "velocity", "position"])
 def test_an_infinite_measurement_counts_as_missing(name):
     # Firmware that divides by the time between pulses sends them.
     measured = np.array([0.0, 1.0, np.inf, -np.inf, np.nan, 5.0])
-    record = a_record(**{"velocity": np.ones(6), name: measured})
+    record = make_record(**{"velocity": np.ones(6), name: measured})
     lost = [False, False, True, True, True, False]
     np.testing.assert_array_equal(np.isnan(getattr(record, name)), lost)
     assert np.isinf(measured[2])  # the caller's array is as it was
 
 
 def test_slice_starts_at_time_zero_and_keeps_inner_segments():
-    part = a_record(starts=(0, 2, 4), count=np.arange(6)).slice(1, 5)
+    part = make_record(starts=(0, 2, 4), count=np.arange(6)).slice(1, 5)
     assert part.starts == (0, 1, 3)
     assert part.time[0] == 0
     np.testing.assert_array_equal(part.count, [1, 2, 3, 4])

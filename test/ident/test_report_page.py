@@ -22,7 +22,7 @@ LONG = "the voltage has one size, 3 V: " + ", ".join(["a driver that looks like 
 SHARES = (("current_scale", 0.03), ("smoothed_current", 0.0043), ("low_passed_current", 0.0022))
 
 
-def poor(wheel: str) -> Estimate:
+def make_full_result(wheel: str) -> Estimate:
     """Return a result that fills a card: many findings, a range, systematic errors."""
     known = estimate(wheel)
     told = dict(known.combinations)
@@ -58,7 +58,7 @@ def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
 def file(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("page") / "report.html"
     report = Report(
-        {wheel: poor(wheel) for wheel in WHEELS},
+        {wheel: make_full_result(wheel) for wheel in WHEELS},
         {wheel: drive() for wheel in WHEELS},
         provenance={"Recordings": "monday", "Command": "identify monday"},
         folder="my results",
@@ -67,7 +67,7 @@ def file(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-def tops(browser: Browser, *selectors: str) -> list[float]:
+def find_tops(browser: Browser, *selectors: str) -> list[float]:
     """Return where the first element of each selector begins, from the top of the page."""
     at = "document.querySelector({!r}).getBoundingClientRect().top + scrollY"
     return [browser.value(at.format(selector)) for selector in selectors]
@@ -91,7 +91,7 @@ def test_report_of_four_wheels_with_many_findings_stays_short(browser, file, wid
 
 def test_wheel_card_shows_values_chart_gains_and_findings_in_order(browser, file):
     browser.open(file, 390)
-    order = tops(
+    order = find_tops(
         browser, "h1", "#side-by-side", "#front_left h2", "#front_left .values",
         "#front_left .chart", "#front_left .gains", "#front_left .findings",
         "#front_left details", "#front_right", "#reading",

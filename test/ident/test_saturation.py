@@ -12,7 +12,7 @@ RATE, RESISTANCE, CONSTANT = 200.0, 2.0, 0.03
 INERTIA, VISCOUS, COULOMB = 4e-5, 2e-5, 2e-3
 
 
-def regulated() -> Record:
+def simulate_regulated_current() -> Record:
     """Return a record of a motor whose driver regulates the current."""
     fine, steps = 20, 2000
     levels = np.random.default_rng(3).uniform(-1.0, 1.0, 40)
@@ -37,7 +37,7 @@ def regulated() -> Record:
 
 
 def test_regulated_current_is_not_refused_as_clipped():
-    record = regulated()
+    record = simulate_regulated_current()
     assert (record.current == record.current.max()).mean() > 0.1
     found = estimate(record)
     assert "current_regulated" in {f.code for f in found.findings}

@@ -26,11 +26,11 @@ def steps(rate=100.0):
     return motors.record("rear_left", voltage=np.repeat(held, 25), rate=rate)
 
 
-def swapped(record):
+def swap_sign(record):
     return replace(record, count=-record.count, velocity=-record.velocity)
 
 
-def late(record, samples):
+def delay_counts(record, samples):
     """Return a record whose counts come late by whole samples."""
     k = np.maximum(np.arange(len(record)) - samples, 0)
     return replace(record, count=record.count[k], velocity=record.velocity[k])
@@ -42,10 +42,10 @@ SLOW = {"steps": steps, "slow sine": lambda: sine(150.0), "fast sine": lambda: s
 @pytest.mark.parametrize("name", SLOW)
 def test_swapped_leads_are_refused_and_correct_ones_accepted(name):
     for delay in (0, 1, 2):
-        record = late(SLOW[name](), delay)
+        record = delay_counts(SLOW[name](), delay)
         _check_signs([record], "record")
         with pytest.raises(SignalError, match="swapped sign, speed"):
-            _check_signs([swapped(record)], "record")
+            _check_signs([swap_sign(record)], "record")
 
 
 def test_swapped_current_sign_is_refused_and_the_correct_one_accepted():
@@ -71,7 +71,7 @@ def test_sign_of_a_lagging_current_is_not_judged_in_a_decimated_record():
 @pytest.mark.parametrize("samples", [2.9, 3.0, 3.1])
 def test_three_samples_per_period_do_not_determine_the_sign(samples, sign):
     """Lag, sampling and the driver's clock may add up to any phase: no cause is named."""
-    record = sine(samples) if sign > 0 else swapped(sine(samples))
+    record = sine(samples) if sign > 0 else swap_sign(sine(samples))
     found = correlate_with_voltage([record], [record.velocity], lags=True)
     # Half a sample is 60 degrees: the nearest delay misses the phase by 30 at most.
     assert min(found.right, found.wrong) > 0.8 * max(found.right, found.wrong)
@@ -89,7 +89,7 @@ def test_a_motor_at_rest_has_no_swapped_sign():
         noise = replace(GOOD, voltage=slow, count=None, current=None, velocity=noise)
         _check_signs([noise], "record")
     with pytest.raises(SignalError, match="swapped sign"):
-        _check_signs([swapped(GOOD)], "record")
+        _check_signs([swap_sign(GOOD)], "record")
 
 
 def test_swapped_sign_is_found_despite_gaps_and_sensor_noise():

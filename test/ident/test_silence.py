@@ -16,7 +16,7 @@ TIME = np.arange(int(10 * RATE)) / RATE
 CHIRP = 10.0 * np.sin(2 * np.pi * (0.3 * TIME + 10.0 * TIME**2))  # to 200 Hz
 
 
-def coarse(signal, volts=CHIRP, rate=RATE):
+def make_coarse_record(signal, volts=CHIRP, rate=RATE):
     """Return a record of one signal, of an encoder of 50 steps a turn."""
     whole = motors.record("rear_left", current=False, voltage=volts, rate=rate)
     count = whole.count // 10
@@ -25,7 +25,7 @@ def coarse(signal, volts=CHIRP, rate=RATE):
     return replace(whole, **{**dict.fromkeys(values), signal: values[signal]})
 
 
-def cut(record, signal, share):
+def disconnect_sensor(record, signal, share):
     """Return a record whose sensor is disconnected after ``share`` of the rows."""
     row = np.arange(len(record))
     off = row > share * len(record)
@@ -36,7 +36,7 @@ def cut(record, signal, share):
 
 @pytest.mark.parametrize("signal", ["count", "position", "velocity"])
 def test_silence_in_a_chirp_beyond_the_bandwidth_is_not_a_dead_encoder(signal):
-    alive = coarse(signal)
+    alive = make_coarse_record(signal)
     values = getattr(alive, signal)
     assert np.ptp(values[int(0.85 * len(values)) :]) == 0.0  # silent although the motor swings
     refuse_silent_sensor(alive, "record")
@@ -46,20 +46,20 @@ def test_silence_in_a_chirp_beyond_the_bandwidth_is_not_a_dead_encoder(signal):
 @pytest.mark.parametrize("kind", ["chirp", "sine", "square", "fourier"])
 def test_disconnected_encoder_is_refused_as_dead(signal, kind):
     if kind == "chirp":
-        whole, shares = coarse(signal), [0.1]
+        whole, shares = make_coarse_record(signal), [0.1]
     else:
         volts = motors.independent.excitation(np.arange(2000) / 200.0, kind, 10.0)
-        whole, shares = coarse(signal, volts, 200.0), [0.2, 0.5, 0.85]
+        whole, shares = make_coarse_record(signal, volts, 200.0), [0.2, 0.5, 0.85]
         refuse_silent_sensor(whole, "record")
     for share in shares:
         with pytest.raises(SignalError, match=f"dead encoder, the {signal} stays"):
-            refuse_silent_sensor(cut(whole, signal, share), "record")
+            refuse_silent_sensor(disconnect_sensor(whole, signal, share), "record")
 
 
 @pytest.mark.parametrize("signal", ["count", "velocity"])
 def test_speed_below_the_sensor_resolution_is_not_a_dead_sensor(signal):
     """A speed quantised to 60 rad/s, or counts of the same motor, under a chirp."""
-    record = coarse(signal)
+    record = make_coarse_record(signal)
     speed = np.gradient(motors.record("rear_left", voltage=CHIRP, rate=RATE).count * 0.01257, TIME)
     if signal == "velocity":
         slow = np.convolve(speed, np.ones(20) / 20, "same")
@@ -77,7 +77,7 @@ def test_a_motor_stopped_by_friction_in_a_fast_chirp_is_not_a_dead_encoder(wheel
 
 def test_a_standstill_at_the_end_of_a_run_does_not_affect_the_next():
     volts = motors.independent.excitation(np.arange(2000) / 200.0, "sine", 10.0)
-    whole = coarse("count", volts, 200.0)
+    whole = make_coarse_record("count", volts, 200.0)
     stands = (np.arange(2000) >= 850) & (np.arange(2000) < 1150)
     kept = np.where(stands, whole.count[850], whole.count).astype(np.int64)
     with pytest.raises(SignalError, match="dead encoder"):

@@ -62,7 +62,7 @@ WINDOW, STEP, UNIT = 32, 1e-3, 0.12982  # samples, s, rounding of the log [rad/s
 TAU, GAIN = 0.025, 17.0
 
 
-def logged_step(volts: float) -> Record:
+def simulate_logged_step(volts: float) -> Record:
     """Return a step whose speed is a position difference in counts, logged as whole units."""
     rng = np.random.default_rng(3)
     time = STEP * np.arange(1900)
@@ -78,7 +78,7 @@ def logged_step(volts: float) -> Record:
 
 @pytest.mark.parametrize("volts", [8.1, -8.1])
 def test_mirrored_step_gives_the_same_estimate(volts):
-    record = logged_step(volts)
+    record = simulate_logged_step(volts)
     mirror = replace(record, voltage=-record.voltage, velocity=-record.velocity)
     one, other = estimate(record), estimate(mirror)
     assert one.model == other.model
@@ -95,6 +95,6 @@ def test_mirrored_step_gives_the_same_estimate(volts):
 
 @pytest.mark.parametrize("sign", [1, -1])
 def test_speed_quantum_is_found_despite_uneven_rounding_of_the_log(sign):
-    speed = logged_step(sign * 8.1).velocity
+    speed = simulate_logged_step(sign * 8.1).velocity
     # A line through 36 levels, each out by half a unit, is out by far less than a unit.
     assert speed_quantum(speed) == pytest.approx(31.25 * UNIT, rel=0.005)

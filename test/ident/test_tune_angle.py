@@ -49,7 +49,7 @@ def loop_of(found, *options: str) -> Loop:
     return tuning.loop_for(found, parser().parse_args(["identification", *options]))
 
 
-def held(one, noise: float, steps: int = 8000):
+def hold_speed(one, noise: float, steps: int = 8000):
     """Return voltage and speed of a PI loop that holds half of the largest speed.
 
     The speed is the angle's difference over one sample, the voltage one sample late.
@@ -81,9 +81,9 @@ def test_angle_noise_limits_the_gains(found):
     assert loop.angle_noise == found.angle_noise
     one = design(found, loop, structure="pi")
     deaf = design(found, replace(loop, angle_noise=0.0), structure="pi")
-    volts, _ = held(deaf, NOISE)
+    volts, _ = hold_speed(deaf, NOISE)
     assert np.mean(np.abs(volts) == SUPPLY) > 0.3
-    volts, speeds = held(one, NOISE)
+    volts, speeds = hold_speed(one, NOISE)
     # Of 6000 samples, whose noise goes against its neighbours', 5 standard deviations of an rms.
     assert volts.std() == pytest.approx(one.performance.control_noise, rel=0.05)
     assert volts.max() < SUPPLY and volts.min() > -SUPPLY

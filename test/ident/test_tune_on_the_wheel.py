@@ -48,7 +48,7 @@ def settings_of(one) -> LoopSettings:
     )
 
 
-def driven(wheel: str, one: Design, setpoint: Callable[[float], float], seconds: float) -> Run:
+def drive_motor(wheel: str, one: Design, setpoint: Callable[[float], float], seconds: float) -> Run:
     """Return the drive of a motor of the paper on its design."""
     return simulate_closed_loop(
         load_motors(MOTORS)[wheel], settings_of(one), setpoint, seconds,
@@ -103,7 +103,7 @@ def test_single_wheel_settles_as_fast_as_its_voltage_allows(estimates, rate, sha
     one = design(estimates["rear_right"], Loop(sample_time=T))
     drive, ratio = one.reference.drive, one.loop.gear_ratio
     target = share * drive.top_speed / ratio
-    run = driven("rear_right", one, lambda time: target, 0.6)
+    run = drive_motor("rear_right", one, lambda time: target, 0.6)
     outside = np.flatnonzero(np.abs(run.velocity - target) > 0.02 * target)
     arrived = run.time[outside[-1] + 1]
     quickest = VoltageLimited(
@@ -118,7 +118,7 @@ def test_friction_feed_forward_switches_in_time_at_a_reversal(estimates):
     T = 0.005
     designs = design_wheels(estimates, {wheel: Loop(sample_time=T) for wheel in estimates}).designs
     for wheel, one in designs.items():
-        run = driven(wheel, one, lambda time: 1.0 if time < 1.0 else -2.0, 2.0)
+        run = drive_motor(wheel, one, lambda time: 1.0 if time < 1.0 else -2.0, 2.0)
         # 0.9 % of the change for the slowest winding; turned with the delayed reference, 2.2 %.
         assert run.velocity.min() > -2.0 - 0.013 * 3.0
 

@@ -32,13 +32,13 @@ def estimates():
     return read_estimates(MOTORS)
 
 
-def observed(rate: float, **more) -> Loop:
+def make_observer_loop(rate: float, **more) -> Loop:
     return Loop(sample_time=1 / rate, speed_source="observer", **more)
 
 
 def test_observer_with_the_true_model_reproduces_the_true_speed(estimates):
     motors = make_motors(estimates["front_left"])
-    loop = observed(200.0, delay=0.01)  # whole samples: the mean voltage is the voltage
+    loop = make_observer_loop(200.0, delay=0.01)  # whole samples: the mean voltage is the voltage
     omega = np.geomspace(1.0, 600.0, 50)
     seen = sample(motors, loop).response(omega)
     true = sample(motors, loop).response(omega, true_speed=True)
@@ -50,7 +50,7 @@ def test_response_with_a_wrong_observer_model_matches_the_simulated_loop(estimat
     actual = Motors(
         1.1 * believed.a0, 0.9 * believed.a1, believed.a2, believed.delay, believed.static_voltage
     )
-    loop = observed(500.0, delay=0.0013)
+    loop = make_observer_loop(500.0, delay=0.0013)
     plant = sample(actual, loop, believed=believed)
     feedback = design(estimates["front_left"], loop).feedback
     # At the gain at which the response says that it oscillates the simulated loop neither grows
@@ -70,7 +70,7 @@ def test_response_with_a_wrong_observer_model_matches_the_simulated_loop(estimat
 @pytest.mark.parametrize("rate", [200.0, 1000.0])
 def test_gain_margin_holds_on_the_running_loop_with_its_observer(estimates, rate):
     T = 1 / rate
-    one = design(estimates["rear_left"], observed(rate))
+    one = design(estimates["rear_left"], make_observer_loop(rate))
     # Without friction and clamp the loop is linear but for the counts.
     entry = load_motors(MOTORS)["rear_left"]
     entry = replace(
@@ -156,7 +156,7 @@ def test_observer_of_a_coasting_driver_is_not_chosen_nor_its_settling_stated(est
     """The observer predicts from the command, which differs from a coasting driver's voltage."""
     coast = ChainRecord(("coast",), {"fast_decay_ratio": 10.0, "viscous": 0.2})
     plain = replace(estimates["front_left"], findings=())
-    coasting, loop = replace(plain, chain=coast, largest_voltage=12.0), observed(500.0)
+    coasting, loop = replace(plain, chain=coast, largest_voltage=12.0), make_observer_loop(500.0)
     assert np.isfinite(design(plain, loop).specification.settling.high)
     assert np.isnan(design(coasting, loop).specification.settling.high)
     chosen, why = choose_source(coasting, replace(loop, speed_source="measured"))

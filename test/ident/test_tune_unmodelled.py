@@ -149,7 +149,7 @@ def test_the_gains_file_states_the_tolerated_model_error():
     assert "pseudo-random" in found["advice"]
 
 
-def resonant(reference, omega, T, damping=0.0):
+def simulate_resonance(reference, omega, T, damping=0.0):
     """A resonance that follows a reference, in small steps of semi-implicit Euler."""
     y = rate = 0.0
     out, sub = [], 200
@@ -166,7 +166,7 @@ def minimum_jerk(T, duration, samples):
     return 10 * s**3 - 15 * s**4 + 6 * s**5
 
 
-def end(y, T):
+def find_settling_time(y, T):
     return T * (np.flatnonzero(np.abs(y - 1) > 0.02)[-1] + 1)
 
 
@@ -179,15 +179,17 @@ def test_resonance_effect_matches_simulated_resonances():
         make_motors(known_up_to(20.0)), replace(LOOP, sample_time=T, difference_window=0)
     )
     more, longer = compute_resonance_effect(unknown, plant, Feedback(0.0, 0.0), reference)
-    behind = [resonant(reference, w, T, 0.05) for w in (20.0, 23.0, 27.0, 32.0, 40.0, 60.0)]
+    behind = [
+        simulate_resonance(reference, w, T, 0.05) for w in (20.0, 23.0, 27.0, 32.0, 40.0, 60.0)
+    ]
     all_of_them = [*behind, *(2 * reference - y for y in behind)]
     # A fiftieth: between the frequencies and dampings that are tried.
     assert more == pytest.approx(max(y.max() for y in all_of_them) - 1, rel=0.02)
-    slowest = max(end(y, T) for y in all_of_them) - end(reference, T)
+    slowest = max(find_settling_time(y, T) for y in all_of_them) - find_settling_time(reference, T)
     assert longer == pytest.approx(slowest, abs=np.pi / 20)  # half a swing
 
 
-def looped(D, feedback, volts, T):
+def simulate_tracking_loop(D, feedback, volts, T):
     """Return the speeds of G, open loop, and of G (1 + D), tracking it one step late."""
     s = control.tf([1, 0], [1])
     G = 25.0 / (1e-4 * s**2 + 0.05 * s + 1)
@@ -211,7 +213,7 @@ def test_resonances_within_the_error_bound_stay_within_the_stated_effect():
     T, s = loop.sample_time, control.tf([1, 0], [1])
     one = known_up_to(20.0)
     volts = minimum_jerk(T, 0.08, 400) / 25.0
-    usual = looped(0 * s, feedback, volts, T)[0]
+    usual = simulate_tracking_loop(0 * s, feedback, volts, T)[0]
     plant = sample(make_motors(one), loop)
     more, longer = compute_resonance_effect(unmodelled_dynamics(one), plant, feedback, usual)
     omega = np.geomspace(0.5, np.pi / T, 2000)
@@ -221,9 +223,9 @@ def test_resonances_within_the_error_bound_stay_within_the_stated_effect():
         shape = s**2 / (s**2 + 2 * damping * at * s + at**2)
         m = np.min(weight / np.abs(control.frequency_response(shape, omega).frdata[0, 0]))
         for sign in (-1, 1):
-            y = looped(sign * min(m, 1.0) * shape, feedback, volts, T)[1]
+            y = simulate_tracking_loop(sign * min(m, 1.0) * shape, feedback, volts, T)[1]
             added.append(y.max() - usual.max())
-            ends.append(end(y, T) - end(usual, T))
+            ends.append(find_settling_time(y, T) - find_settling_time(usual, T))
     assert max(added) <= 1.02 * more
     assert max(added) > 0.7 * more
     assert max(ends) <= longer + np.pi / 40

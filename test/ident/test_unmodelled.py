@@ -12,7 +12,7 @@ from smp_motor_ident.record import Record
 from smp_motor_ident.report.document import identification_document, read_identification
 
 
-def lines(rng, n=600, error=0.0, noise=1.0):
+def draw_lines(rng, n=600, error=0.0, noise=1.0):
     """Return spectral lines: frequency, error with noise, and output of unit magnitude."""
     omega = np.linspace(1.0, 100.0, n)
     output = np.exp(2j * np.pi * rng.random(n))
@@ -26,7 +26,7 @@ def test_confidence_circle_covers_the_error_at_its_stated_level():
     for seed in range(200):
         rng = np.random.default_rng(seed)
         true = 0.7 * np.exp(2j * np.pi * rng.random())
-        found = compute_relative_error(*lines(rng, error=true))
+        found = compute_relative_error(*draw_lines(rng, error=true))
         radius = np.array(found.bound) - np.array(found.shown)
         inside += list(np.abs(np.array(found.shown) - 0.7) <= radius)
     assert np.mean(inside) > 0.95
@@ -47,7 +47,7 @@ def test_confidence_circle_of_windowed_noise_covers_zero_at_its_stated_level():
 
 def test_bound_grows_where_the_output_is_small():
     rng = np.random.default_rng(1)
-    omega, error, output = lines(rng, noise=0.01)
+    omega, error, output = draw_lines(rng, noise=0.01)
     found = compute_relative_error(omega, error, output / (1 + (omega / 10) ** 2))
     bound = np.array(found.bound)
     # A response that falls to 1/50 or less in the last band, with 25 times the lines.
@@ -60,7 +60,7 @@ def test_resonance_narrower_than_its_band_is_detected_at_its_peak():
     missed, found = 0, 0
     for seed in range(40):
         rng = np.random.default_rng(seed)
-        omega, error, output = lines(rng, n=1200, noise=1.5)
+        omega, error, output = draw_lines(rng, n=1200, noise=1.5)
         error += 3.0 * 5j * omega / (50.0**2 - omega**2 + 5j * omega) * output
         shown = compute_relative_error(omega, error, output)
         k = int(np.argmin(np.abs(np.log(np.array(shown.frequency) / 50.0))))
@@ -74,19 +74,19 @@ def test_resonance_narrower_than_its_band_is_detected_at_its_peak():
 
 def test_model_error_is_judged_by_the_least_excited_output():
     rng = np.random.default_rng(3)
-    omega, error, output = lines(rng, noise=0.1)
+    omega, error, output = draw_lines(rng, noise=0.1)
     faint = output / (1 + (omega / 10) ** 2)
     alone, both = (
         compute_relative_error(omega, error, x) for x in (faint, np.array([output, faint]))
     )
     assert both == alone
     # An error beyond the response itself counts, whatever moved the motor.
-    _, _, other = lines(rng)
+    _, _, other = draw_lines(rng)
     both = compute_relative_error(omega, error + 3.0 * output, np.array([output, 1e-2 * other]))
     assert both.shown == pytest.approx([3.0] * len(both.shown), rel=0.05)
 
 
-def two_inertias_under_ramps(seed: int) -> tuple[Record, Callable[[np.ndarray], np.ndarray]]:
+def simulate_two_inertias(seed: int) -> tuple[Record, Callable[[np.ndarray], np.ndarray]]:
     """Speed [rad/s] of a load with dry friction on a spring, and its response to the voltage."""
     rng, T, n, sub = np.random.default_rng(seed), 0.002, 5000, 20
     gain, tau, ring, damping, share = 20.0, 0.07, 85.0, 0.05, 0.6
@@ -115,7 +115,7 @@ def two_inertias_under_ramps(seed: int) -> tuple[Record, Callable[[np.ndarray], 
 
 
 def test_friction_kinks_under_ramps_do_not_count_as_excitation():
-    made, response = two_inertias_under_ramps(4)
+    made, response = simulate_two_inertias(4)
     one = estimate(made)
     error, (gain, tau) = one.residuals.model_error, map(one.value, ("dc_gain", "time_constant"))
     frequency, bound = np.array(error.frequency), np.array(error.bound)

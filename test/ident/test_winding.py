@@ -13,7 +13,7 @@ from smp_motor_ident.record import Record
 R, L, K, J, B, TC = 3.2, 2e-3, 0.03, 1.4e-5, 5.5e-5, 2e-3
 
 
-def signal(rise: float, seed: int, friction: float = TC) -> Record:
+def simulate_signal(rise: float, seed: int, friction: float = TC) -> Record:
     """Return 6 s of a motor with increased resistance under three tones."""
     rng = np.random.default_rng(seed)
     time = 5e-3 * np.arange(1200)
@@ -27,14 +27,14 @@ def signal(rise: float, seed: int, friction: float = TC) -> Record:
 @pytest.mark.parametrize("seed", range(5))
 @pytest.mark.parametrize("friction", [TC, 5 * TC])
 def test_winding_resistance_is_estimated_independent_of_friction(seed, friction):
-    found = resistance(signal(0.1, seed, friction))
+    found = resistance(simulate_signal(0.1, seed, friction))
     assert found.value == pytest.approx(1.1 * R, abs=4 * found.std)
     assert found.std < 0.03 * R
 
 
 @pytest.mark.parametrize("rise", [0.3, 0.5])
 def test_heated_winding_stops_the_commissioning(rise):
-    (finding,) = report_heated_winding("left", [signal(0.0, 1)], signal(rise, 2))
+    (finding,) = report_heated_winding("left", [simulate_signal(0.0, 1)], simulate_signal(rise, 2))
     assert finding.code == "winding_hot" and finding.severity == "refused"
     assert finding.evidence["warmer"] == pytest.approx(rise / 0.00393, rel=0.1)
     assert "--resume" in finding.advice
@@ -42,17 +42,19 @@ def test_heated_winding_stops_the_commissioning(rise):
 
 @pytest.mark.parametrize("seed", range(20))
 def test_normal_winding_warming_does_not_stop_the_commissioning(seed):
-    assert not report_heated_winding("left", [signal(0.0, seed)], signal(0.1, 100 + seed))
+    assert not report_heated_winding(
+        "left", [simulate_signal(0.0, seed)], simulate_signal(0.1, 100 + seed)
+    )
 
 
 def test_winding_resistance_is_unknown_without_current():
-    bare = replace(signal(0.5, 1), current=None)
+    bare = replace(simulate_signal(0.5, 1), current=None)
     assert resistance(bare) is None
-    assert not report_heated_winding("left", [signal(0.0, 1)], bare)
+    assert not report_heated_winding("left", [simulate_signal(0.0, 1)], bare)
 
 
 def test_winding_resistance_skips_segment_boundaries_and_lost_samples():
-    record = signal(0.0, 3)
+    record = simulate_signal(0.0, 3)
     current = record.current.copy()
     current[200:220] = np.nan
     count = record.count.copy()
