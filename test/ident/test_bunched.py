@@ -24,7 +24,7 @@ def test_equal_stamps_of_a_periodic_sensor_are_repaired_with_a_finding():
     plain = estimate(motors.record("rear_left", current=False, seconds=8.0))
     found = estimate(make_bunched_record(4))
     assert "arrival_beat" in [f.code for f in found.findings]
-    # The beat is known to a twentieth of a sample: a hundredth of the lag that it is late by.
+    # The sampling instants are known to 1/20 of a sample: about 1/100 of the time constant.
     assert found.value("dc_gain") == pytest.approx(plain.value("dc_gain"), rel=0.002)
     assert found.value("time_constant") == pytest.approx(plain.value("time_constant"), rel=0.02)
 

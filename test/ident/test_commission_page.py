@@ -79,13 +79,13 @@ def test_page_shows_gains_then_yaml_then_verification_drive(passed, tmp_path):
             "Checks of the wheels",
         ]  # fmt: skip
         assert read_texts(browser, ".verdict") == ["Passed. The wheels drove as designed."]
-        # The numbers are those of the JSON, each with the scatter of the records.
+        # The numbers equal those of the JSON, with their standard deviations.
         rows = {
             row.split("\t")[0]: row.split("\t")[1:] for row in read_texts(browser, "#results tr")
         }
         assert rows["p V s/rad"] == ["2.675"] * 4 and rows["i V/rad"] == ["87.97"] * 4
         assert rows["DC gain rad/s/V"] == ["25.50 ± 0.10"] * 4
-        # Systematic errors stand apart, all of them in the width of the page.
+        # Systematic errors are listed separately and fit the page width.
         assert [" ".join(cell.split()) for cell in rows["Resistance Ω"]] == [
             "12.92 ± 0.13 ± 3 % (current scale), ± 0.43 % (current smoothing), "
             "± 0.22 % (current low-pass)"

@@ -32,7 +32,7 @@ def test_dry_run_prints_the_plan_and_creates_no_files(tmp_path, capsys):
         "from  30.0 s: steps",
     ]  # fmt: skip
     assert "slowly until it turns" in lines[0] and "8 V" in lines[0]
-    # A square is at one of its ends: three quarters of 8 V either way.
+    # A square wave has two levels: 3/4 of 8 V in either direction.
     assert set(lines[4].strip()) == {"▁", "█"}
     # Four wheels: 32 s of checks, 35 s of signals and 4 s around each, 32 s to compute, the drive.
     assert "6 V" in lines[3] and "35 s of excitation, about 2 min 5 s in all" in lines[-1]
@@ -50,7 +50,7 @@ class Steps:
     def __init__(self, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         self.folder, self.done = folder, list[str]()
         self.given = ["--output", str(folder), "--yes"]
-        self.cut, self.fuel = "", 100  # moves that a run completes before it is cut off
+        self.cut, self.fuel = "", 100  # moves that a run completes before it is interrupted
         self.left = 0
         self.found, self.heat = tuple[Finding, ...](), list[Finding]()
         self.bounds, self.sent = dict[str, object](), list[Any]()
@@ -126,7 +126,7 @@ def test_resumed_commissioning_sends_the_same_commands_as_an_uninterrupted_one(r
     shutil.rmtree(robot.folder)
     assert main([*robot.given, "--amplitude", "5", "--duration", "2"]) == 130
     runs = 1
-    while main([*robot.given, "--resume"]) == 130:  # each does one part more
+    while main([*robot.given, "--resume"]) == 130:  # each run completes one more part
         runs += 1
     assert runs == 5 and robot.sent == sent
     # Recordings at different voltages are not mixed.
@@ -148,7 +148,7 @@ def test_interrupted_motion_is_repeated_and_completed_motion_is_not(tmp_path, ro
     assert main([*robot.given, "--resume"]) == 130
     robot.cut = ""
     assert main([*robot.given, "--resume"]) == 0
-    # Cut off in the first signal; then in identify after all four; then no wheel moves again.
+    # Interrupted in the first signal, then in identify; the third run moves no wheel.
     ended = ["identify", "validate", "tune", "verify"]
     assert robot.done == ["check", "excite", *["excite"] * 4, "identify", *ended]
     document = json.loads((robot.folder / "commissioning.json").read_text())
@@ -271,7 +271,7 @@ def test_remaining_time_is_estimated_from_completed_steps_of_the_same_kind():
 
 
 def test_imprecise_estimate_requests_one_more_recording():
-    known = make_estimate()  # to a percent, and the gain better
+    known = make_estimate()  # std of 1 %, of the gain less
     assert plan.plan_extra_recording({"left": known}, 6.0) is None
     vague = replace(known.combinations["time_constant"], std=0.002)  # 5 %
     open_ = replace(known, combinations={**known.combinations, "time_constant": vague})

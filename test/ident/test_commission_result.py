@@ -50,7 +50,7 @@ class Robot:
 
     def record(self, robot: steps.Robot, name: str) -> None:
         self.draft = robot.folder / name
-        self.draft.mkdir()  # an interruption leaves it
+        self.draft.mkdir()  # left behind by an interruption
 
     def excite(self, robot: steps.Robot, plan: Sequence[steps.Excitation]) -> None:
         self.use()
@@ -64,7 +64,7 @@ class Robot:
 
 
 def write(folder: Path, did: Record) -> None:
-    """Write a record as ``record`` records it."""
+    """Write a record as the ``record`` node does."""
     stamps = START + np.rint(1e9 * did.time).astype(np.int64)
     position = did.count * 2 * math.pi / COUNTS / RATIO
     signals = did.voltage, did.current, did.velocity / RATIO, position, did.count

@@ -181,7 +181,7 @@ def _coarse(record: Record, counts: float, samples: int) -> Record:
 def test_low_fit_due_to_coarse_counts_is_not_unreliable():
     fine = motors.record("rear_left", current=False, seconds=20.0, kinds=("fourier", "square"))
     coarse = _coarse(replace(fine, count=None), 2.0, 4)
-    found = estimate(coarse)  # a count more or less is 157 rad/s of at most 300
+    found = estimate(coarse)  # the quantum is 157 rad/s, the largest speed 300 rad/s
     assert found.fit_percent.estimation < 70  # below the limit for an unexplained speed
     assert not found.unreliable
     motors.check(found, motors.truth("rear_left", 0.3), ["dc_gain"])

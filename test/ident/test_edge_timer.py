@@ -66,7 +66,7 @@ def simulate_record(tick: float, per_turn: float | None) -> Record:
 def test_held_edge_timer_readings_are_not_estimated_as_dead_zone(tick, per_turn):
     record = simulate_record(tick, per_turn)
     (said,) = [f for f in interpolate_edge_timing(record).findings if f.code == "edge_timer"]
-    assert said.evidence["count"] == pytest.approx(COUNT, rel=0.25)  # by how it is held: to a row
+    assert said.evidence["count"] == pytest.approx(COUNT, rel=0.25)  # from holding times, to a row
     found = estimate(record)
     assert "dead_zone" not in found.combinations and not found.unreliable
     check(found, {"dc_gain": GAIN, "static_voltage": STATIC}, most=0.25)

@@ -50,7 +50,7 @@ def test_once_per_turn_encoder_error_is_estimated(error):
 
 
 COMMAND_RATE = 200.0
-FINER = 20  # steps of the driver's clock to a sample
+FINER = 20  # steps of the driver's clock per sample
 
 
 def simulate_command_jitter(latest: float, seed: int) -> Record:
@@ -64,7 +64,7 @@ def simulate_command_jitter(latest: float, seed: int) -> Record:
         given[k : k + late] = fine[k - 1]
     t = np.arange(given.size) / (COMMAND_RATE * FINER)
     out = simulate(t, given, *TABLE_1["rear_left"], 0.0, np.zeros(t.size), 4)
-    rows = np.arange(FINER - 1, given.size, FINER)  # a row holds what ran up to its instant
+    rows = np.arange(FINER - 1, given.size, FINER)  # held over the interval before
     speed = out[rows, 1] + 0.2 * rng.standard_normal(rows.size)
     return Record("rear_left", t[rows] - t[rows[0]], asked, velocity=speed)
 
@@ -120,7 +120,7 @@ def test_step_load_is_found_without_parameter_bias(counts, at):
     true = motors.truth("rear_left", STATIC)
     assert not found.unreliable
     names = ["dc_gain", "static_voltage", *(() if counts else ("resistance", "inductance"))]
-    motors.check(found, true, names, floor=2e-3, most=0.05)  # the simulator's steps: 1e-3
+    motors.check(found, true, names, floor=2e-3, most=0.05)  # error of the simulator's steps: 1e-3
 
 
 @pytest.mark.parametrize(("counts", "back"), [(False, SECONDS), (True, SECONDS), (True, 9.4)])

@@ -32,7 +32,7 @@ def test_all_parameters_are_recovered_with_current_and_friction(wheel):
     assert result.model == "electromechanical"
     assert result.identifiable
     check(result, truth, PHYSICAL)
-    assert result.value("dc_gain") == pytest.approx(truth["dc_gain"], rel=5e-3)  # the issue's
+    assert result.value("dc_gain") == pytest.approx(truth["dc_gain"], rel=5e-3)  # issue's bound
     assert result.fit_percent.validation > 95
     json.dumps(result.to_document(), allow_nan=False)
 
@@ -104,7 +104,7 @@ def test_fixed_resistance_alone_separates_no_parameters_without_current():
     ("wheel", "friction", "model", "other", "floor", "most"),
     [
         ("rear_left", 0.0, "second_order", "inductance", 0.0, None),
-        # Its back-EMF takes 3 % of the voltage; the bound for 12 s is 1.5 %.
+        # The back-EMF is 3 % of the voltage; the bound for 12 s is 1.5 %.
         ("front_right", 0.3, "auto", "inductance", 0.0, 0.1),
         ("front_right", 0.3, "auto", "motor_constant", 1e-4, 0.01),  # of a data sheet
     ],

@@ -44,7 +44,7 @@ def test_autocorrelation_curve_agrees_with_the_whiteness_verdict():
     curve = result.residuals.autocorrelation
     inside = bool(np.all(np.abs(curve.value[1:]) < curve.band))
     assert result.residuals.white == inside
-    assert curve.value[0] == pytest.approx(1.0, abs=1e-12)  # by definition, but for rounding
+    assert curve.value[0] == pytest.approx(1.0, abs=1e-12)  # by definition, up to rounding
 
 
 def test_findings_of_the_reader_are_kept():
@@ -68,7 +68,7 @@ def test_time_constant_uncertainty_covers_a_lag_of_the_speed_sensor(share):
                             velocity=noisy))  # fmt: skip
     motor, filtered = found.combinations["time_constant"], found.value("sensor_lag")
     assert abs(motor.value + filtered - (1.02 + share) * lag) < 0.003
-    if not filtered:  # all of it may be the filter's
+    if not filtered:  # the whole second lag may be the filter's
         assert abs(motor.value - 1.02 * lag) < 2.5 * motor.total_std
 
 

@@ -119,7 +119,7 @@ def test_one_signal_mapping_applies_to_every_recording(tmp_path):
     assert main([*bags, "--fleet", *MAPPED, "--output", str(tmp_path / "out"), "--quiet"]) == 0
     table = list(csv.DictReader((tmp_path / "out" / "fleet.csv").open()))
     assert [r["robot"] for r in table] == ["one", "two"]
-    # A hundredth: 1200 samples at 0.3 % of noise tell the gain a hundred times better.
+    # 1 %: 1200 samples at 0.3 % noise determine the gain a hundred times better.
     assert [float(r["dc_gain"]) for r in table] == pytest.approx([25.0, 25.0], rel=0.01)
     assert all(float(r["dc_gain_low"]) < float(r["dc_gain"]) < float(r["dc_gain_high"])
                for r in table)  # fmt: skip
@@ -132,7 +132,7 @@ def test_recording_date_is_read_and_results_are_printed_with_units(tmp_path, cap
         for robot in ("one", "two")
         for day in (0, 3)
     ]
-    for bag in bags:  # as a copy has it
+    for bag in bags:  # file times of a copy
         os.utime(bag, (0.0, 0.0))
     out = tmp_path / "out"
     assert main([*map(str, bags), "--fleet", *MAPPED, "--output", str(out)]) == 0

@@ -66,7 +66,7 @@ def test_identify_writes_its_three_files_and_recovers_the_motor(recording, tmp_p
         found = motor["combinations"][name]
         # Four standard deviations: 1 in 16,000 by chance, and the seed is fixed.
         assert abs(found["value"] - truth) < 4 * found["std"]
-        assert found["std"] < 0.02 * truth  # 2000 samples at 0.3 % noise tell it far better
+        assert found["std"] < 0.02 * truth  # 2000 samples at 0.3 % noise determine it far better
     assert motor["sources"] == ["log"] or motor["sources"] == ["log.csv"]
     (entry,) = load_motors(output / "motors.yaml").values()
     assert entry.parameters.dc_gain == pytest.approx(motor["combinations"]["dc_gain"]["value"])

@@ -47,7 +47,7 @@ def test_gain_at_one_amplitude_has_a_narrow_interval_and_a_stated_range():
     assert gain.valid == {"voltage": (-10.0, 10.0)}
     one_size = share_of(gain, "one_size_of_voltage")
     assert 0.02 < one_size.share < 0.5
-    # A voltmeter ten times as good as the assumed bridge leaves a tenth of it.
+    # Ten times the assumed voltage accuracy leaves a tenth of the uncertainty.
     meter = replace(made, hardware=replace(made.hardware, voltage_accuracy=0.01))
     measured = share_of(estimate(meter).combinations["dc_gain"], "one_size_of_voltage")
     assert measured is None or measured.size == pytest.approx(0.1 * one_size.size, rel=0.05)

@@ -77,7 +77,7 @@ def test_gap_begins_a_segment_and_out_of_order_sample_is_discarded():
     before = len(window)
     window.add(NOW + 2 * SECOND, state(1.0, np.nan, 0.0, 0.0, 0))
     assert len(window) == before
-    for k in range(2):  # a single sample between gaps tells nothing
+    for k in range(2):  # a single sample between gaps has no information
         window.add(NOW + 7 * SECOND + k * 5_000_000, state(1.0, np.nan, 0.0, 0.0, 0))
     record = window.record()
     assert record.starts == (0, before)

@@ -15,7 +15,7 @@ GAIN, LAG, FRICTION, RATE = 60.0, 0.014, 1.0, 500.0
 
 
 def simulate_ramps(lost: float, seed: int = 0) -> Record:
-    """A motor of first order under a triangle of 7 V, solved in a hundredth of a sample."""
+    """Return a first-order motor under a triangle wave of 7 V, with a share of rows lost."""
     rng = np.random.default_rng(seed)
     n, fine = 1700, 100
     t = np.arange(n) / RATE

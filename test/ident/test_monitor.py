@@ -84,7 +84,7 @@ def simulate_monitor(seconds, change=lambda motor, time: False, disturbed=False,
             if disturbed and rng.random() < 0.03:
                 lost_until = time + rng.uniform(0.05, 3.0)
         if disturbed:
-            # The battery sags under current and over the day; a slope comes and goes.
+            # The battery voltage sags with current and time; the load is a varying slope.
             volts *= (1.0 - 0.15 * time / seconds) * (1 - 0.1 * abs(motor.state[0]))
             load = 0.5 * MOTOR.coulomb_friction * math.sin(2 * math.pi * time / 97)
         motor.step(volts, load, time < held_until)

@@ -29,7 +29,7 @@ def _motion(kind, seconds, rate=500.0):
 
 
 def _record(kind: str, signal: str, current: bool) -> Record:
-    t, v, out = _motion(kind, 8.0 if signal == "counts" else 4.0)  # 64 a turn tell less
+    t, v, out = _motion(kind, 8.0 if signal == "counts" else 4.0)  # longer for 64 counts a turn
     motion: dict[str, np.ndarray] = {
         "counts": {"count": np.floor(out[:, 2] * 64 / (2 * np.pi)).astype(np.int64)},
         "speed": {"velocity": out[:, 1].copy()},

@@ -22,7 +22,7 @@ TRUTH = {"dc_gain": 15.0, "time_constant": 0.12, "static_voltage": 2.0}
 
 
 def _record(voltage: np.ndarray, rate: float = 500.0, noise: float = 0.5) -> Record:
-    """Return the exact first-order answer with Coulomb friction, driven one way, and noise."""
+    """Return the exact first-order response with Coulomb friction in one direction, and noise."""
     gain, tau, friction = TRUTH.values()
     rng = np.random.default_rng(3)
     keep = np.exp(-1 / rate / tau)
@@ -55,7 +55,7 @@ def test_one_voltage_level_identifies_only_the_steady_speed(rest):
 
 def test_lag_uncertainty_covers_the_breakaway_delay_of_one_step():
     # From rest the winding first builds up the torque that friction holds: 0.6 V of 8 V are a
-    # delay of 1.5 ms, which another winding and no friction explain as well.
+    # delay of 1.5 ms, confounded with another inductance without friction.
     step = np.r_[np.zeros(100), np.full(900, 8.0)]
     record = motors.record(
         "rear_left", current=False, voltage=step, kinds=("x",), rate=1000.0, static_voltage=0.6
@@ -112,7 +112,7 @@ def test_rest_before_the_excitation_does_not_change_the_estimate():
     driven = motors.record("rear_left", current=False, seconds=3.0)
     n = 4000
     t = np.arange(n + len(driven)) / 200.0
-    volts = np.r_[np.zeros(n + 1), driven.voltage[1:]]  # a row holds what ran up to it
+    volts = np.r_[np.zeros(n + 1), driven.voltage[1:]]  # held over the interval before
     rested = replace(driven, time=t, voltage=volts, velocity=np.r_[np.zeros(n), driven.velocity],
                      count=np.r_[np.full(n, driven.count[0]), driven.count])  # fmt: skip
     with_it, without = estimate(rested), estimate(driven)
@@ -169,7 +169,7 @@ def test_angle_mapped_as_velocity_is_refused_with_advice():
 
 
 def test_time_constant_is_estimated_from_one_step_of_coarse_counts():
-    # 64 counts a turn at 5 kHz: between two samples there is a count or none.
+    # 64 counts a turn at 5 kHz: at most one count per sample.
     t = np.arange(15000) / 5000.0
     gain, tau, net = 17.5, 0.015, 6.6
     angle = gain * net * (t - tau * (1 - np.exp(-t / tau)))
@@ -198,7 +198,7 @@ def test_constant_load_does_not_bias_gain_and_friction():
         angle += w / rate / fine
     rng = np.random.default_rng(2)
     position = np.array(out[::fine]) + 1e-3 * rng.standard_normal(v.size)
-    held = np.r_[0.0, v[:-1]]  # what ran up to each row
+    held = np.r_[0.0, v[:-1]]  # voltage of the interval before each row
     found = estimate(Record("motor", t[::fine], held, position=position))
     # 4 standard deviations (one in 16,000), plus the error of the test's grid
     motors.check(found, {"dc_gain": gain, "static_voltage": friction}, floor=2e-3)
@@ -253,7 +253,7 @@ def test_stiction_under_a_ramp_is_not_estimated_as_delay(sharp):
 
 RATE = 2000.0
 TIME = np.arange(int(6 * RATE)) / RATE
-CHIRP = 10.0 * np.sin(2 * np.pi * (0.3 * TIME + 6.0 * TIME**2))  # to 72 Hz: a small swing at last
+CHIRP = 10.0 * np.sin(2 * np.pi * (0.3 * TIME + 6.0 * TIME**2))  # to 72 Hz: small amplitude
 
 
 def make_weakened_record(volts: np.ndarray, share: float, rate: float) -> Record:
@@ -322,7 +322,7 @@ def test_a_motor_at_rest_with_a_noisy_angle_is_refused_despite_its_current():
     voltage = np.repeat(rng.choice([-0.1, 0.0, 0.1], 40), 15)
     decay = np.exp(-step * resistance / inductance)
     current = np.zeros(voltage.size)
-    for k in range(1, voltage.size):  # a row's voltage ran before it
+    for k in range(1, voltage.size):  # held over the interval before
         current[k] = decay * current[k - 1] + (1 - decay) * voltage[k] / resistance
     position = 1e-3 * rng.standard_normal(voltage.size)
     noisy = current + 1e-4 * rng.standard_normal(voltage.size)

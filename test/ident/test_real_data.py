@@ -43,7 +43,7 @@ def test_prbs_of_one_day_explains_the_other_day(fitted, kept):
     assert np.degrees(result.value("dc_gain")) == pytest.approx(159.9, rel=0.03)
     assert 0.030 < result.value("time_constant") < 0.042
     assert result.fit_percent.validation > 94
-    # Speed in steps of a count per sample: the filter is one sample long.
+    # The speed is a difference of counts over one sample, so the window is one sample.
     assert result.value("averaging_window") == pytest.approx(0.020, abs=0.002)
 
 
@@ -51,7 +51,7 @@ def test_scatter_over_five_days_is_within_the_stated_uncertainty():
     estimates = [estimate_day(*days) for days in (*EACH_OTHER, *OTHERS)]
     found = [one.combinations for one in estimates]
     for name in ("dc_gain", "time_constant", "static_voltage"):
-        # The load differs from day to day, which no recording of one shows.
+        # The load differs from day to day, which one recording cannot show.
         value, std = (
             np.array([getattr(f[name], a) for f in found]) for a in ("value", "total_std")
         )
@@ -76,5 +76,5 @@ def test_friction_from_ten_steps_agrees_with_their_steady_speeds():
     # Lines through the five steady speeds of each way: 13.9 and 14.5 rad/s/V, 1.07 and 1.15 V.
     for name, known in (("dc_gain", 14.2), ("static_voltage", 1.11)):
         q = result.combinations[name]
-        # The two ways differ by 4 and 7 % themselves.
+        # The two directions differ by 4 and 7 %.
         assert q.value == pytest.approx(known, rel=0.1) and abs(q.value - known) < 2 * q.std

@@ -44,7 +44,7 @@ def make_full_result(wheel: str) -> Estimate:
 
 
 def drive() -> list[Comparison]:
-    """Return 40 s of a speed that follows a square of the voltage, the last third held out."""
+    """Return 40 s under a square-wave voltage, with the last third held out."""
     return [comparison("estimation", 27.0), comparison("validation", 13.0)]
 
 
@@ -79,7 +79,7 @@ def test_report_of_four_wheels_with_many_findings_stays_short(browser, file, wid
     browser.open(file, width, dark=dark)
     # A phone of 390 px shows a third of 1280 px, so the limit of 5,000 is scaled.
     assert browser.value("document.documentElement.scrollHeight") <= highest
-    for _ in range(2):  # as it opens, and with everything unfolded
+    for _ in range(2):  # folded, then unfolded
         assert browser.value("document.documentElement.scrollWidth") <= width
         assert browser.value(
             "[...document.querySelectorAll('main table')].every(t => t.closest('.scroll') ||"

@@ -43,4 +43,4 @@ def test_regulated_current_is_not_refused_as_clipped():
     assert "current_regulated" in {f.code for f in found.findings}
     gain = CONSTANT / (RESISTANCE * VISCOUS + CONSTANT**2)
     for name, true in (("resistance", RESISTANCE), ("dc_gain", gain)):
-        assert found.value(name) == pytest.approx(true, rel=0.02)  # a fiftieth costs a loop nothing
+        assert found.value(name) == pytest.approx(true, rel=0.02)  # 2 % is negligible for a loop

@@ -31,7 +31,7 @@ def swap_sign(record):
 
 
 def delay_counts(record, samples):
-    """Return a record whose counts come late by whole samples."""
+    """Return a record with counts delayed by whole samples."""
     k = np.maximum(np.arange(len(record)) - samples, 0)
     return replace(record, count=record.count[k], velocity=record.velocity[k])
 

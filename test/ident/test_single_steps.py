@@ -84,9 +84,9 @@ def test_mirrored_step_gives_the_same_estimate(volts):
     assert one.model == other.model
     assert [f.severity for f in one.findings] == [f.severity for f in other.findings]
     for name in ("time_constant", "averaging_window"):
-        # The same sums in other signs: nothing but rounding may differ.
+        # The same sums with opposite signs: only rounding may differ.
         assert one.value(name) == pytest.approx(other.value(name), rel=1e-6)
-    # A remaining lag takes up to 3 ms from the window; under one step a driver's ramp looks alike.
+    # A remaining lag takes up to 3 ms from the window; one step is confounded with a driver ramp.
     ramp = one.chain.values.get("ramp_time", 0.0)
     assert one.value("averaging_window") + ramp == pytest.approx(WINDOW * STEP, abs=0.004)
     lag = one.combinations["time_constant"]

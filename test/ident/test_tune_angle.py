@@ -74,7 +74,7 @@ def hold_speed(one, noise: float, steps: int = 8000):
 
 def test_angle_noise_limits_the_gains(found):
     """Differenced over a sample, 3 mrad are 8.5 rad/s rms: gains that ignore it saturate."""
-    # 8000 samples tell a standard deviation to 1 %; five times that.
+    # 8000 samples determine a standard deviation to 1 %: five times that.
     assert found.angle_noise == pytest.approx(NOISE, rel=0.05)
     assert found.speed_noise == 0.0
     loop = loop_of(found, "--speed-source", "measured")
@@ -84,7 +84,7 @@ def test_angle_noise_limits_the_gains(found):
     volts, _ = hold_speed(deaf, NOISE)
     assert np.mean(np.abs(volts) == SUPPLY) > 0.3
     volts, speeds = hold_speed(one, NOISE)
-    # Of 6000 samples, whose noise goes against its neighbours', 5 standard deviations of an rms.
+    # 5 standard deviations of the rms of 6000 negatively correlated samples.
     assert volts.std() == pytest.approx(one.performance.control_noise, rel=0.05)
     assert volts.max() < SUPPLY and volts.min() > -SUPPLY
     assert speeds.mean() == pytest.approx(0.5 * GAIN * SUPPLY, rel=0.01)

@@ -52,7 +52,7 @@ def test_identified_combinations_give_the_gains_of_the_true_ones_within_two_perc
     loop = Loop()
     true = design(estimate(), loop).gains
     for _ in range(5):
-        # A tenth of a percent is what 30 s of a Fourier voltage leave, and more.
+        # 0.1 % exceeds the standard deviations of 30 s of Fourier voltage.
         wrong = {n: v * (1 + 1e-3 * rng.normal()) for n, v in combinations(TABLE[0]).items()}
         gains = design(estimate(0, std=1e-3, **wrong), loop).gains
         for name in ("p", "i", "d"):
@@ -99,7 +99,7 @@ def test_robustness_holds_on_an_independent_sample_of_motors():
     one = design(estimate(1, std=0.05), Loop(), seed=1)
     fresh = sample(draw_motors(estimate(1, std=0.05), 4000, np.random.default_rng(99)), Loop())
     verdict = UncertaintyEnsemble(fresh, METHODS["margin"].required).assess(one.feedback)
-    # 99 % of 1000 draws: the binomial spread of a fresh sample is 0.3 %, three of them.
+    # 99 % minus three binomial standard deviations of a fresh sample, 0.3 % each.
     assert verdict.holds >= 0.98
     assert verdict.stable == 1.0
 

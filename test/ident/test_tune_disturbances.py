@@ -54,7 +54,7 @@ def test_torque_noise_and_timing_jitter_widen_the_bands():
     assert math.isnan(shaken.specification.settling.high)
     assert math.isfinite(scattered.specification.settling.high)
     assert scattered.specification.settling.high >= exact.specification.settling.high
-    assert scattered.reference.doubt == pytest.approx(3e-3)  # the transition is not lengthened
+    assert scattered.reference.doubt == pytest.approx(3e-3)  # latency adds to the uncertainty
 
 
 def test_overshoot_band_covers_an_identified_encoder_eccentricity():
@@ -99,7 +99,7 @@ def test_outliers_of_the_speed_are_rejected_by_the_loop():
         reading = true + rng.normal() + outlier * rng.uniform(-250.0, 250.0)
         off = abs(reading - true)
         taken = not math.isnan(loop.speed(T, reading, 0, volts))
-        if outlier and k % 60 > 20 and off > 40.0:  # where it is steady
+        if outlier and k % 60 > 20 and off > 40.0:  # at steady state
             believed.append(taken)
         elif not outlier:
             lost.append(not taken)

@@ -67,7 +67,7 @@ def test_integer_gains_report_their_steady_state_error():
     one = design(BENCH.estimate_of(BENCH.TABLE_1["rear_left"]), loop, samples=60, **TARGETS)
     gains = target.convert(one)
     numbers = gains.numbers
-    # An error of one tick less than Ko/Kp is divided to nothing.
+    # Integer division gives zero for errors below Ko/Kp ticks.
     rest = math.ceil(numbers["Ko"] / numbers["Kp"]) * 2 * np.pi / 11 * 30
     assert gains.resting_error <= rest
     assert check(one, gains).resting_error > 0
@@ -76,7 +76,7 @@ def test_integer_gains_report_their_steady_state_error():
 def test_unsupported_control_interval_is_refused_with_the_nearest_rate(tmp_path, capsys):
     for name, rate, nearest in (
         ("arduino_pid", "300", "--rate 333.333"),
-        ("ros_arduino_bridge", "30", "--rate 30.303"),  # 1000 / 30 in whole numbers
+        ("ros_arduino_bridge", "30", "--rate 30.303"),  # integer 1000 / 30
     ):
         assert main([str(MOTORS), "--export", name, "--rate", rate]) == 1
         assert nearest in capsys.readouterr().err
@@ -103,4 +103,4 @@ def test_identification_texts_cannot_escape_comments_in_exports(tmp_path, capsys
     text = capsys.readouterr().out
     assert not [line for line in text.splitlines() if line.startswith("#define EVIL")]
     assert not [line for line in text.splitlines() if line.endswith("\\")]
-    assert "robot1/left_pid" not in text  # no name of C
+    assert "robot1/left_pid" not in text  # not a C identifier

@@ -150,7 +150,7 @@ def test_relay_feedback_tolerates_lost_samples():
     whole = read_oscillation([(voltage, speed)], 0.005)
     # One sample of twenty is a straight line between its neighbours, a twelfth of a period apart.
     assert (gain, period) == pytest.approx(whole, rel=0.05)
-    # Without the voltage that acted, the one that was asked for tells nearly the same.
+    # Without the applied voltage the commanded one gives nearly the same.
     asked = read_oscillation(*resample_evenly({**answer, "applied": [np.nan] * kept.sum()}))
     assert asked == pytest.approx(whole, rel=0.05)
 
@@ -160,7 +160,7 @@ def test_relay_oscillation_is_evaluated_between_gaps_in_the_samples():
     voltage, speed = oscillate(one, 3.0, one.loop.count_angle / 0.005, 4.0)
     period = read_oscillation([(voltage, speed)], 0.005)[1]
     time = 0.005 * np.arange(voltage.size)
-    # Five cycles, then none of the samples of two fifths of one: no stretch alone is enough.
+    # Five cycles alternate with gaps of 0.4 cycles: no single stretch is long enough.
     kept = time % (5.4 * period) < 5 * period
     answer = {"time": time, "voltage": voltage, "applied": np.roll(voltage, 2), "speed": speed}
     answer = {name: x[kept] for name, x in {**answer, "angle": 0.005 * np.cumsum(speed)}.items()}

@@ -49,7 +49,7 @@ def settings_of(one) -> LoopSettings:
 
 
 def drive_motor(wheel: str, one: Design, setpoint: Callable[[float], float], seconds: float) -> Run:
-    """Return the drive of a motor of the paper on its design."""
+    """Return the simulated drive of a motor of the paper with its design."""
     return simulate_closed_loop(
         load_motors(MOTORS)[wheel], settings_of(one), setpoint, seconds,
         timing=Timing(sample_time=one.loop.sample_time, delay=one.loop.expected_delay),
@@ -119,7 +119,7 @@ def test_friction_feed_forward_switches_in_time_at_a_reversal(estimates):
     designs = design_wheels(estimates, {wheel: Loop(sample_time=T) for wheel in estimates}).designs
     for wheel, one in designs.items():
         run = drive_motor(wheel, one, lambda time: 1.0 if time < 1.0 else -2.0, 2.0)
-        # 0.9 % of the change for the slowest winding; turned with the delayed reference, 2.2 %.
+        # 0.9 % of the change for the slowest winding; switched with the delayed reference, 2.2 %.
         assert run.velocity.min() > -2.0 - 0.013 * 3.0
 
 

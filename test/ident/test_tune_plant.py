@@ -27,7 +27,7 @@ def motors(a0: float, a1: float, a2: float, delay: float = 0.0) -> Motors:
 
 
 def integrate(coefficients, delay, sample_time, inputs):
-    """Speed and angle at the sampling instants, by a general-purpose ODE solver."""
+    """Return speed and angle at the sampling instants, by a general-purpose ODE solver."""
     a0, a1, a2 = coefficients
 
     def rates(t, x, volts):
@@ -79,7 +79,7 @@ def test_sampled_motor_with_any_delay_and_window_is_exact(coefficients, delay, w
 
 def test_frequency_response_tends_to_the_static_gain_at_low_frequency():
     plant = sample(motors(*MOTOR_1), Loop(sample_time=0.001, delay=0.0))
-    # At 1 mrad/s what differs from the static gain is below 1e-4.
+    # At 1 mrad/s the deviation from the static gain is below 1e-4.
     assert abs(plant.response(np.array([1e-3]))[0, 0]) == pytest.approx(1 / MOTOR_1[0], rel=1e-4)
 
 
@@ -183,7 +183,7 @@ def test_margins_on_a_coarse_frequency_grid_agree_with_exact_ones():
             errors.append(max(0.0 if a == b else abs(b / a - 1) for a, b in pairs))
     # The grid of 400 points over three decades resolves a margin to about half a percent.
     assert np.quantile(errors, 0.95) < 5e-3
-    assert max(errors) < 0.02  # where the curve all but touches the unit circle
+    assert max(errors) < 0.02  # where the curve nearly touches the unit circle
 
 
 @pytest.mark.parametrize("sample_time", [0.01, 0.001])

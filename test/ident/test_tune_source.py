@@ -53,8 +53,8 @@ def test_response_with_a_wrong_observer_model_matches_the_simulated_loop(estimat
     loop = make_observer_loop(500.0, delay=0.0013)
     plant = sample(actual, loop, believed=believed)
     feedback = design(estimates["front_left"], loop).feedback
-    # At the gain at which the response says that it oscillates the simulated loop neither grows
-    # nor decays, and the eigenvalues say the same.
+    # At the ultimate gain of the response the simulated loop neither grows
+    # nor decays, and the eigenvalues agree.
     omega = np.linspace(5.0, np.pi * 500.0, 200_000)
     L = (plant.response(omega) * feedback.response(omega, 1 / 500))[0]
     crossings = np.flatnonzero((L[:-1].imag > 0) != (L[1:].imag > 0))
@@ -71,7 +71,7 @@ def test_response_with_a_wrong_observer_model_matches_the_simulated_loop(estimat
 def test_gain_margin_holds_on_the_running_loop_with_its_observer(estimates, rate):
     T = 1 / rate
     one = design(estimates["rear_left"], make_observer_loop(rate))
-    # Without friction and clamp the loop is linear but for the counts.
+    # Without friction and clamp the loop is linear except for the counts.
     entry = load_motors(MOTORS)["rear_left"]
     entry = replace(
         entry, parameters=replace(entry.parameters, coulomb_friction=0.0), supply_voltage=1e6

@@ -30,7 +30,7 @@ DOUBT = Finding("dead_zone", "unreliable", "a dead zone of 2 V", {}, "record slo
 def test_design_accounts_for_the_speed_filter_of_the_firmware(sensor, name):
     value = next(iter(sensor.values()))
     aware, ignorant = design(estimate(**{name: value}), LOOP), design(estimate(), LOOP)
-    # A quarter of a percent: the test's integration in steps of a fiftieth.
+    # 0.25 %: error of the integration in steps of T/50.
     assert overshoot(aware, TRUE, **sensor) <= aware.specification.overshoot.high + 0.25
     assert overshoot(aware, TRUE, **sensor) < 2.0
     assert overshoot(ignorant, TRUE, **sensor) > 3.0
@@ -79,7 +79,7 @@ def test_reference_changes_stay_within_the_driver_slew_rate():
 
 
 def test_gains_identified_at_one_voltage_amplitude_hold_at_others():
-    """A driver that is clipped where it was recorded has a fifth more gain at half the speed."""
+    """A driver that clipped in the recording has 20 % more gain at half the speed."""
     level = Finding("one_size_of_voltage", "warning", "the voltage has one size, 12 V")
     moves = {"dc_gain": 0.1 * TRUE["dc_gain"], "static_voltage": -0.1 * TRUE["static_voltage"]}
     error = Systematic("one_size_of_voltage", 0.1, moves)
@@ -112,7 +112,7 @@ def test_drives_within_the_uncertainty_stay_within_the_specified_bands():
 
 
 def margins_on(motor, made):
-    """Return the margins of a design's gains on another motor."""
+    """Return the margins of a design's gains with another motor."""
     return loop_margins(sample(motor, made.loop), made.feedback)
 
 
@@ -169,7 +169,7 @@ def test_unreliable_identification_is_refused_or_lowers_the_gains_if_accepted():
     assert wide.gains.i < 0.95 * sure.gains.i
     assert wide.specification.settling.high > sure.specification.settling.high
     assert any("unreliable identification" in words for words in wide.warnings)
-    # A note or a warning is no reason to refuse.
+    # Notes and warnings do not cause a refusal.
     assert design(estimate(findings=[replace(DOUBT, severity="warning")]), LOOP).gains == sure.gains
 
 

@@ -38,7 +38,7 @@ def known_up_to(frequency: float) -> Estimate:
 
 
 def sensitivity(one, omega):
-    """The complementary sensitivity, by python-control from the sampled transfer functions."""
+    """Return the complementary sensitivity, computed by python-control."""
     T = one.loop.sample_time
     gain, tau, tp = (one.motor[n] for n in ("dc_gain", "time_constant", "time_constant_product"))
     z = control.tf([1, 0], [1], T)
@@ -59,7 +59,7 @@ def test_loop_bandwidth_stays_within_the_excited_band():
     free, held = (design(known_up_to(f), loop) for f in (600.0, 5.0))
     omega = np.geomspace(10.0, 600.0, 100)
     assert sensitivity(free, omega).max() > 0.6
-    # Nothing is known from 10 rad/s on, where 2 is taken for the relative error.
+    # Above 10 rad/s nothing is known, and a relative error of 2 is assumed.
     assert sensitivity(held, omega).max() < 0.51
     assert held.robustness.unmodelled == pytest.approx(1.0, abs=0.03)
     assert "unmodelled_dynamics" in [f.code for f in held.findings]
@@ -74,7 +74,7 @@ def test_loop_bandwidth_of_every_method_stays_within_the_excited_band(method):
 
 
 def test_significant_model_error_limits_the_loop_gain_at_its_frequency():
-    # Of ten times the response, at one frequency: stable with every phase of it.
+    # A resonance of ten times the response: stable for every phase.
     bound = tuple(3.0 if f == 50.0 else 0.05 for f in FREQUENCY)
     shown = tuple(2.5 if b > 1 else 0.01 for b in bound)
     one = design(estimate(shown, bound), replace(LOOP, difference_window=0))
@@ -150,7 +150,7 @@ def test_the_gains_file_states_the_tolerated_model_error():
 
 
 def simulate_resonance(reference, omega, T, damping=0.0):
-    """A resonance that follows a reference, in small steps of semi-implicit Euler."""
+    """Return the response of a resonance to a reference, by semi-implicit Euler."""
     y = rate = 0.0
     out, sub = [], 200
     for r in reference:
@@ -183,7 +183,7 @@ def test_resonance_effect_matches_simulated_resonances():
         simulate_resonance(reference, w, T, 0.05) for w in (20.0, 23.0, 27.0, 32.0, 40.0, 60.0)
     ]
     all_of_them = [*behind, *(2 * reference - y for y in behind)]
-    # A fiftieth: between the frequencies and dampings that are tried.
+    # 2 %: loss between the tested frequencies and dampings.
     assert more == pytest.approx(max(y.max() for y in all_of_them) - 1, rel=0.02)
     slowest = max(find_settling_time(y, T) for y in all_of_them) - find_settling_time(reference, T)
     assert longer == pytest.approx(slowest, abs=np.pi / 20)  # half a swing
@@ -270,7 +270,7 @@ def test_band_excludes_less_than_1_percent_on_either_side():
     for beyond in (figures > found.high, figures < found.low):
         assert 0 < np.mean(beyond) < 0.01
     assert band(500.0, figures).high == 500.0
-    # A motor that never settles is later than all others; three of them are more than 1 %.
+    # A motor that never settles counts as the latest; three of 300 exceed 1 %.
     later = figures.copy()
     later[figures > 298] = np.nan
     assert band(150.0, later).high == 298.0

@@ -21,7 +21,7 @@ def draw_lines(rng, n=600, error=0.0, noise=1.0):
 
 
 def test_confidence_circle_covers_the_error_at_its_stated_level():
-    # Independent lines tell more than those of a window: the circle then holds it more often.
+    # Independent lines carry more information than windowed ones, so the coverage is higher.
     inside = []
     for seed in range(200):
         rng = np.random.default_rng(seed)
@@ -87,7 +87,7 @@ def test_model_error_is_judged_by_the_least_excited_output():
 
 
 def simulate_two_inertias(seed: int) -> tuple[Record, Callable[[np.ndarray], np.ndarray]]:
-    """Speed [rad/s] of a load with dry friction on a spring, and its response to the voltage."""
+    """Return the record of a spring-coupled load with dry friction, and its response."""
     rng, T, n, sub = np.random.default_rng(seed), 0.002, 5000, 20
     gain, tau, ring, damping, share = 20.0, 0.07, 85.0, 0.05, 0.6
     spring, loss = (x * share * (1 - share) for x in (ring**2, 2 * damping * ring))

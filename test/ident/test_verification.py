@@ -66,7 +66,7 @@ def drive(one, entry=ENTRY, load=0.0, late=0.0, wait=0.0, offset=0.0):
 def test_nominal_wheel_is_within_its_bands(designed):
     change = drive(designed)
     assert v.judge([change]) == []
-    # The prediction is the drive, but for the steps of the duty cycle.
+    # The prediction matches the drive up to the steps of the duty cycle.
     assert np.abs(change.nominal - change.speed).max() < 0.01 * change.setpoint
 
 
@@ -80,7 +80,7 @@ def test_prediction_includes_sampling_jitter(designed):
 def test_prediction_includes_unanswered_samples(designed):
     loop = {"sample_time": STEP, "delay": STEP, "supply_voltage": 12.0}
     instants = STEP * np.arange(-60, 240)
-    # 60 ms without an answer while the wheel gets faster: the voltage stays and is too large.
+    # 60 ms without control while the wheel accelerates: the held voltage is too large.
     silent = np.where((instants > 0.05) & (instants < 0.11), np.nan, 0.0)
     setpoints = np.where(instants < 0.0, 0.0, 1.0)
     rows = [
@@ -94,7 +94,7 @@ def test_prediction_includes_unanswered_samples(designed):
 
 
 def test_prediction_includes_the_integral_left_by_the_previous_change(designed):
-    # Friction of 2 V holds the wheel after each stop, so the integral stays.
+    # Friction of 2 V holds the wheel after each stop, so the integral is not reset.
     values = combinations_of(ENTRY.parameters) | {"static_voltage": 2.0}
     rubbing = MotorParameters.from_combinations(**values)
     known = {**ESTIMATE.combinations, "static_voltage": Quantity(2.0, status="fixed")}
@@ -122,7 +122,7 @@ def test_arrival_delay_is_measured_from_the_applied_voltages():
     rng = np.random.default_rng(4)
     time = STEP * np.arange(200)
     commands, ages = rng.uniform(-10.0, 10.0, time.size), np.full(time.size, 0.001)
-    # In effect from the next sample on; between 0.50 and 0.54 s the driver takes none.
+    # Commands act from the next sample on; between 0.50 and 0.54 s none arrives.
     arrived = time + STEP
     arrived[(arrived > 0.501) & (arrived < 0.539)] = 0.54
     latest = np.array([np.flatnonzero(arrived <= t + 1e-9)[-1:] for t in time[:-1]], dtype=object)
@@ -203,5 +203,5 @@ def test_speed_resolution_matches_the_scatter_of_the_smoothed_slope():
     time = np.arange(0.0, 20.0, STEP)
     angle = quantum * np.floor(speed * time / quantum)
     _, slope = v.smooth_speed(time, angle, STEP)
-    # Errors of a staircase repeat and are not independent: to a factor of two.
+    # Errors of a staircase are periodic, not independent: tolerance of a factor of two.
     assert 0.5 < np.std(slope[20:-20]) / v.resolution(quantum, STEP) < 2.0

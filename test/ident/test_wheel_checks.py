@@ -76,7 +76,7 @@ def test_check_figures_match_the_simulated_motor():
     # The speed of the last half of a hold has settled to exp(-5); counts resolve it to 0.1 %.
     assert GOOD.gain == pytest.approx(GAIN, rel=0.01)
     assert GOOD.friction == pytest.approx(FRICTION, abs=0.02)
-    # A ramp of 2 V/s, some 10 counts and a time constant behind the start.
+    # On a ramp of 2 V/s the start is detected 10 counts and a time constant late.
     assert FRICTION < GOOD.breakaway < FRICTION + 0.2
     # Friction takes Vc/(V - Vc) ln(V/Vc) of it, a quarter, and the first sample some.
     assert 0.6 * SLOW < GOOD.coast < SLOW
@@ -142,7 +142,7 @@ def test_gear_ratio_contradicting_counts_or_motor_file_is_refused():
     assert codes(shown(velocity_scale=0.75))["gear_ratio"] == "refused"
     assert codes(shown(velocity_scale=-1.0))["velocity_sign"] == "refused"
     assert codes(ratios={"wheel_0": 65.5})["gear_ratio"] == "refused"
-    # Counts of edges taken for lines make the motor four times as fast.
+    # Edges counted as lines make the motor appear four times as fast.
     assert codes(gains={"wheel_0": GAIN / 4})["unexpected_gain"] == "refused"
     assert "unexpected_gain" not in codes(gains={"wheel_0": 1.2 * GAIN})
 
@@ -157,7 +157,7 @@ def test_a_dead_zone_is_separated_from_friction():
 def test_low_supply_is_refused_by_applied_voltage_or_battery_report():
     weak = shown(applied=0.7)
     assert weak.applied == pytest.approx(0.7)
-    # Friction and gain are of the voltage that arrives: the motor is the same.
+    # Friction and gain refer to the applied voltage: the motor is the same.
     assert weak.gain == pytest.approx(GAIN, rel=0.02)
     assert codes(weak)["supply_low"] == "refused"
     assert codes(battery=9.0)["supply_low"] == "refused"
@@ -171,10 +171,10 @@ def test_dragging_wheel_is_separated_from_normal_friction_scatter():
     heavier = codes(replace(GOOD, coast=5 * GOOD.coast))
     assert heavier["coasts_longer"] == "warning" and "friction_outlier" not in heavier
     assert "friction_outlier" not in codes(replace(GOOD, friction=1.8 * FRICTION))
-    # A load that leaves room for one level only: friction and gain cannot be separated.
+    # With one level only, friction and gain cannot be separated.
     heavy = replace(GOOD, friction=math.nan, gain=math.nan, breakaway=3.3)
     assert codes(heavy)["friction_outlier"] == "refused"
-    # Two wheels cannot tell which of them is the odd one.
+    # With two wheels the outlier is ambiguous.
     two = {"a": GOOD, "b": replace(GOOD, friction=9 * FRICTION)}
     found = judge(Robot(two, dict.fromkeys(two, HARDWARE)))
     assert "friction_outlier" not in {f.code for f in found}
@@ -187,7 +187,7 @@ def test_check_voltage_suffices_if_friction_is_a_tenth_and_counts_resolve_the_sp
 
 
 def test_queued_samples_give_the_same_check_figures():
-    # A busy computer takes samples 0.2 s late: a phase begins with samples of the one before.
+    # With samples 0.2 s late, a phase begins with samples of the previous one.
     seen, phases = trace()
     late = np.concatenate([np.full(40, seen.phase[0]), seen.phase[:-40]])
     found = figures(replace(seen, phase=late), phases, HARDWARE)
