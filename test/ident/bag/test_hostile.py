@@ -26,7 +26,7 @@ def test_reading_cost_is_bounded_by_file_size(name):
 
 
 def test_workbook_exceeding_time_limit_is_refused(tmp_path, monkeypatch):
-    monkeypatch.setattr(apart, "PATIENCE", 0.5)
+    monkeypatch.setattr(apart, "TIMEOUT_S", 0.5)
     name, write, mapping = HOSTILE.CASES["xlsx: numbers"]
     write(tmp_path)
     with pytest.raises(BagError, match="is not read after 1 s, too long for its size"):
