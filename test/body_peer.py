@@ -28,7 +28,7 @@ GEOMETRY = [
 
 
 class Peer(DomainNode):
-    """The rest of the robot: sends commands and feedback, keeps what skid_steer sends."""
+    """The rest of the robot: sends commands and feedback, stores messages of skid_steer."""
 
     def __init__(self, domain: int) -> None:
         super().__init__(domain, "peer")
@@ -77,7 +77,7 @@ class Peer(DomainNode):
         self.states[wheel].publish(message)
 
     def speeds(self) -> dict[str, float]:
-        """Newest set-points by wheel; empty before the first."""
+        """Return the newest set-point of each wheel; empty before the first."""
         if not self.setpoints:
             return {}
         last = self.setpoints[-1]

@@ -65,7 +65,7 @@ class Browser:
         os.close(self._in)
 
     def _page(self) -> str:
-        """The first page, which may need a moment to appear."""
+        """Return the first page, which may need a moment to appear."""
         for _ in range(200):
             for one in self.ask("Target.getTargets")["targetInfos"]:
                 if one["type"] == "page":
@@ -156,7 +156,7 @@ class Browser:
 
 
 def violations(browser: Browser) -> list[str]:
-    """What axe-core calls serious or critical, with the elements."""
+    """Return serious and critical violations found by axe-core, with their elements."""
     browser.value(Path(AXE.origin).with_name("axe.min.js").read_text("utf-8") + ";0")
     said = browser.ask(
         "Runtime.evaluate", awaitPromise=True, returnByValue=True,
@@ -202,7 +202,7 @@ class Clicks:
         )
 
     def arm(self) -> None:
-        """Arm, again where a busy machine was silent for too long."""
+        """Arm, and repeat if a busy machine was silent for too long."""
         if self.text("arm") != "Armed":
             self.click("arm")
         self.until(

@@ -13,7 +13,7 @@ TABLE_1 = {
 
 
 def combinations_of(p):
-    """Return what voltage and speed tell of a motor or of its model."""
+    """Return the parameter combinations identifiable from voltage and speed."""
     names = ("dc_gain", "time_constant", "time_constant_product", "static_voltage")
     return {name: getattr(p, name) for name in names}
 

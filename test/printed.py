@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Pages that print results: what they show against a fresh run."""
+"""Comparison of results printed on pages with a fresh run."""
 
 import re
 from collections.abc import Iterable
@@ -26,7 +26,7 @@ def last_digit(number: str) -> float:
 def agree(shown: str, fresh: str) -> bool:
     """Tell whether two lines are the same, numbers to one unit in their last digit.
 
-    Another processor rounds the sums of a fit in another way, which may turn a printed digit.
+    Other processors round the sums of a fit differently, which may change a printed digit.
     """
     pairs = zip(NUMBER.findall(shown), NUMBER.findall(fresh), strict=False)
     return shape(shown) == shape(fresh) and all(
@@ -35,7 +35,7 @@ def agree(shown: str, fresh: str) -> bool:
 
 
 def not_printed(shown: Iterable[str], fresh: Iterable[str]) -> list[str]:
-    """Return the lines that are shown, and that a fresh run does not print in this order."""
+    """Return the shown lines that a fresh run does not print in this order."""
     rest, missing = list(fresh), []
     for line in shown:
         at = next((k for k, one in enumerate(rest) if agree(line, one)), None)

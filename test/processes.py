@@ -104,7 +104,7 @@ class TestProcess:
             os.killpg(self.pid, signal.SIGINT)
 
     def wait(self, timeout: float) -> int:
-        """Return the exit code; fail with the output if it does not come, however busy it is."""
+        """Return the exit code; fail with the output after the time-out."""
         try:
             code = self._process.wait(timeout + BUSY)
         except subprocess.TimeoutExpired:
@@ -115,7 +115,7 @@ class TestProcess:
         return code
 
     def end(self) -> None:
-        """End whatever is left of the process group."""
+        """End all remaining processes of the group."""
         with contextlib.suppress(ProcessLookupError):
             if self.returncode is None:
                 os.killpg(self.pid, signal.SIGINT)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Benchmarks, which no other test runs, import what there is, and nothing private."""
+"""Benchmarks, which no other test runs, import only existing public names."""
 
 import ast
 import importlib
@@ -12,7 +12,7 @@ FOLDER = Path(__file__).resolve().parents[1] / "benchmarks"
 SCRIPTS = sorted(FOLDER.glob("*.py"))
 
 
-def imported(path: Path) -> Iterator[tuple[str, str]]:
+def list_imports(path: Path) -> Iterator[tuple[str, str]]:
     """Yield module and name of every import of a script, those within functions too."""
     for node in ast.walk(ast.parse(path.read_text(), str(path))):
         if isinstance(node, ast.Import):
@@ -21,7 +21,7 @@ def imported(path: Path) -> Iterator[tuple[str, str]]:
             yield from ((node.module, each.name) for each in node.names)
 
 
-def defined(path: Path) -> set[str]:
+def list_definitions(path: Path) -> set[str]:
     """Return the names that a script binds at its top level."""
     names = set()
     for node in ast.parse(path.read_text()).body:
@@ -38,7 +38,7 @@ def exists(module: str, name: str) -> bool:
     """Tell whether a module of the project, or a script of the folder, has a name."""
     script = FOLDER / f"{module}.py"
     if script.exists():
-        return not name or name in defined(script)
+        return not name or name in list_definitions(script)
     found = importlib.import_module(module)
     if not name or hasattr(found, name):
         return True
@@ -50,9 +50,9 @@ def exists(module: str, name: str) -> bool:
 
 
 @pytest.mark.parametrize("path", SCRIPTS, ids=lambda path: path.stem)
-def test_a_benchmark_imports_public_names_that_exist(path):
+def test_benchmarks_import_only_existing_public_names(path):
     ours = {script.stem for script in SCRIPTS}
-    for module, name in imported(path):
+    for module, name in list_imports(path):
         if module in ours or module.startswith("smp_"):
             assert not name.startswith("_"), f"{module}.{name} is private"
             assert exists(module, name), f"{module} has no {name}"

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Every printed command is run, or is marked with its requirements and names existing options.
+"""Every printed command is run, or is marked with its requirements and uses existing options.
 
 A fence is ``bash`` if its commands run here, page by page in order, and ``sh`` if they need
 something else: its first line names it.  ``output`` is printed by the fence before it, and the
@@ -74,7 +74,7 @@ def commands(lines: list[str]) -> list[list[str]]:
     return [words for line in text.splitlines() if (words := shlex.split(line, comments=True))]
 
 
-def of_language(language: str) -> list[tuple[str, list[str]]]:
+def blocks_in(language: str) -> list[tuple[str, list[str]]]:
     return [(page, lines) for page in PAGES for name, lines in blocks(page) if name == language]
 
 
@@ -85,7 +85,7 @@ def program(page: str, language: str) -> str:
 
 
 @pytest.mark.parametrize("page", PAGES)
-def test_fences_say_whether_their_commands_run_here(page):
+def test_code_blocks_declare_whether_their_commands_run_here(page):
     for language, lines in blocks(page):
         assert language in LANGUAGES, f"{page}: ```{language}"
         if language == "sh":
@@ -98,8 +98,8 @@ def test_fences_say_whether_their_commands_run_here(page):
                 assert not command, f"{page}: a command in a block without language: {line}"
 
 
-@pytest.mark.parametrize(("page", "lines"), of_language("sh"))
-def test_commands_that_do_not_run_here_name_existing_options(page, lines):
+@pytest.mark.parametrize(("page", "lines"), blocks_in("sh"))
+def test_commands_not_run_here_use_existing_options(page, lines):
     for words in commands(lines):
         name, arguments = words[0], words[1:]
         if name == "ros2" and words[1:3] == ["run", "smp_motor_control"]:
@@ -111,7 +111,7 @@ def test_commands_that_do_not_run_here_name_existing_options(page, lines):
             own, _ = split_arguments(arguments)
             assert PARSERS[name]().parse_args(own), f"{page}: {words}"
         elif name in NODES and "--ros-args" in arguments:
-            parameters = known(name)
+            parameters = declared_parameters(name)
             for given in re.findall(r"(?<=-p )([\w.]+):=", " ".join(arguments)):
                 assert given in parameters, f"{page}: {name} has no parameter {given}"
         elif name == "make":
@@ -125,7 +125,7 @@ def test_commands_that_do_not_run_here_name_existing_options(page, lines):
             assert set(given) <= set(declared), f"{page}: {words}"
 
 
-def known(node: str) -> set[str]:
+def declared_parameters(node: str) -> set[str]:
     """Return the parameters that a node declares."""
     import importlib
 
@@ -136,7 +136,7 @@ def known(node: str) -> set[str]:
     return {*parameters_in(module.Settings), "use_sim_time"}
 
 
-# The recordings that the pages speak of.
+# The recordings that the pages refer to.
 
 STEP = 0.01
 PARTS, WINDOW = 5, 16
@@ -146,7 +146,7 @@ SENSOR = 0.005
 
 
 def motion(seed: int, seconds: float = 12.0) -> SimpleNamespace:
-    """One of the paper's motors under random steps, its encoder read at 100 Hz."""
+    """Simulate a motor of the paper under random steps, with its encoder read at 100 Hz."""
     motor = Motor(load_motors(ROOT / "config/motors_paper.yaml")["front_left"].parameters)
     n = round(seconds / STEP)
     rng = np.random.default_rng(seed)
@@ -166,7 +166,7 @@ def motion(seed: int, seconds: float = 12.0) -> SimpleNamespace:
 
 
 def write_bag(path: Path, one: SimpleNamespace, own: bool, current: bool = False) -> None:
-    """Write our messages, or PWM and joint states as other robots have them."""
+    """Write our messages, or PWM and joint states as on other robots."""
     stamps = START + np.rint(1e9 * one.t).astype(np.int64)
     if own:
         mean = np.concatenate(([0.0], one.u[:-1]))  # over the interval that ends with the sample
@@ -180,8 +180,11 @@ def write_bag(path: Path, one: SimpleNamespace, own: bool, current: bool = False
         recordings.write_bag(path, in_order(speeds, duties))
 
 
-def driven_by_pid_v1(seconds: float) -> np.ndarray:
-    """The same motor under PID_v1 (Kp 15, Ki 150, 10 ms, 255 is 12 V): t, set-point, speed."""
+def simulate_pid_v1(seconds: float) -> np.ndarray:
+    """Simulate the motor under PID_v1 (Kp 15, Ki 150, 10 ms, 255 is 12 V).
+
+    Return columns of time, set-point and speed.
+    """
     motor = Motor(load_motors(ROOT / "config/motors_paper.yaml")["front_left"].parameters)
     n = round(seconds / STEP)
     targets = np.repeat(np.random.default_rng(7).uniform(-2.5, 2.5, n // 30 + 1), 30)[:n]
@@ -199,7 +202,7 @@ def driven_by_pid_v1(seconds: float) -> np.ndarray:
 
 @pytest.fixture(scope="module")
 def inputs(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The recordings, and the result that one page works on."""
+    """Return a folder with the recordings, and with the result that one page uses."""
     folder = tmp_path_factory.mktemp("documentation")
     for seed, name in enumerate(("my_bag", "monday", "tuesday", "wednesday"), 1):
         write_bag(folder / name, motion(seed), own=True)
@@ -213,14 +216,14 @@ def inputs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     np.savetxt(folder / "log_20260601161631.csv", np.column_stack(columns), delimiter=",",
                header="Timestamp(ms),Commanded_PWM,Motor_Speed(RPM)", comments="",
                fmt="%.9g")  # fmt: skip
-    loop = driven_by_pid_v1(seconds=12.0)
+    loop = simulate_pid_v1(seconds=12.0)
     np.savetxt(folder / "loop.csv", loop, delimiter=",", header="t,target,speed", comments="",
                fmt="%.9g")  # fmt: skip
     assert identify.main([str(folder / "my_bag"), "--output", str(folder / "result"), "-q"]) == 0
     return folder
 
 
-@pytest.mark.parametrize("page", dict.fromkeys(page for page, _ in of_language("bash")))
+@pytest.mark.parametrize("page", dict.fromkeys(page for page, _ in blocks_in("bash")))
 def test_commands_run_in_the_order_of_their_page(page, inputs, tmp_path, monkeypatch, capsys):
     made = {words[3] for name, lines in blocks(page) if name == "bash"
             for words in commands(lines) if words[2:3] == ["--output"]}  # fmt: skip
@@ -244,7 +247,7 @@ def test_commands_run_in_the_order_of_their_page(page, inputs, tmp_path, monkeyp
                 printed = out.splitlines()
 
 
-def test_the_driver_of_the_page_publishes_counts_and_applies_commands():
+def test_driver_example_publishes_counts_and_applies_commands():
     names: dict[str, object] = {}
     exec(compile(program("docs/howto/your-hardware.md", "python"), "your-hardware", "exec"), names)
     counts, applied = iter((2**15 - 1, -(2**15))), []
@@ -316,7 +319,7 @@ def board(tmp_path_factory):
     return run
 
 
-def test_the_firmware_of_the_page_speaks_the_protocol_and_stops_on_silence(board):
+def test_firmware_example_follows_protocol_and_stops_on_silence(board):
     good = encode_voltages([3.0, -6.0]).decode()
     said = f"{good}{good.replace('3000', '9000')}+150000\n+150000\n"
     lines = board(said)
@@ -325,11 +328,11 @@ def test_the_firmware_of_the_page_speaks_the_protocol_and_stops_on_silence(board
     assert states[0].battery == pytest.approx(818 * 15 / 1023, abs=1e-3)
     assert len(states) == 4
     duty = [int(line.split()[2]) for line in lines if line.startswith("pwm 5")]
-    # The spoilt line of 9 V changes nothing; after 0.3 s of silence the motor is off.
+    # The corrupted line of 9 V changes nothing; after 0.3 s of silence the motor is off.
     assert duty == [63, 63, 63, 0]
 
 
-def test_the_firmware_of_the_page_drops_commands_that_waited_in_a_queue(board):
+def test_firmware_example_drops_outdated_queued_commands(board):
     # Each line takes 10 ms of the board's clock; the command of 3 V answers its sample at 10 ms.
     command = encode_age(10_000).decode() + encode_voltages([3.0, 3.0]).decode()
     fresh = encode_age(1_440_000).decode() + encode_voltages([6.0, 6.0]).decode()
@@ -338,7 +341,7 @@ def test_the_firmware_of_the_page_drops_commands_that_waited_in_a_queue(board):
     assert duty == [0, 63, 0, 0, 0, 0, 127]
 
 
-def test_layouts_use_topics_that_the_wheels_publish():
+def test_plot_layouts_use_published_topics_and_fields():
     text = (ROOT / "smp_interfaces/msg/PidState.msg").read_text()
     fields = {line.split()[1] for line in text.splitlines() if line and line[0] not in "#"}
     topics = {f"/{wheel}/pid_state" for wheel in WHEELS}
@@ -351,7 +354,7 @@ def test_layouts_use_topics_that_the_wheels_publish():
     assert {field for _, field in drawn} <= fields
 
 
-def test_the_page_of_nodes_matches_the_nodes():
+def test_nodes_page_matches_the_nodes():
     made = subprocess.run(
         [sys.executable, ROOT / "scripts/nodes.py"], check=True, capture_output=True, text=True
     )
@@ -360,7 +363,7 @@ def test_the_page_of_nodes_matches_the_nodes():
 
 
 @pytest.mark.slow
-def test_the_page_of_the_paper_is_what_its_command_computes(tmp_path):
+def test_paper_page_matches_its_command(tmp_path):
     command = [sys.executable, ROOT / "benchmarks/paper.py", "--output", tmp_path]
     subprocess.run(command, check=True, capture_output=True)
     shown, fresh = (
@@ -370,10 +373,10 @@ def test_the_page_of_the_paper_is_what_its_command_computes(tmp_path):
     assert stale == [], "make paper"
 
 
-def test_our_names_in_the_table_of_ros2_controllers_are_parameters():
+def test_names_in_ros2_controllers_table_are_existing_parameters():
     text = (ROOT / "docs/ros2-controllers.md").read_text()
     topics = set(re.findall(r"`([\w/<>~]+)`", (ROOT / "docs/nodes.md").read_text())) | {"/tf"}
-    names = known("skid_steer"), known("wheel_pid"), topics
+    names = declared_parameters("skid_steer"), declared_parameters("wheel_pid"), topics
     for there, part in zip(names, text.split("\n## ")[1:], strict=True):
         rows = [line.split("|") for line in part.splitlines() if line.startswith("| ")][1:]
         ours = {name for row in rows for name in re.findall(r"`([\w./<>~]+)`", row[2])}
@@ -381,8 +384,8 @@ def test_our_names_in_the_table_of_ros2_controllers_are_parameters():
         assert all(row[2].strip() or row[3].strip() for row in rows)  # nothing without a reason
 
 
-def test_data_blocks_are_valid():
-    for _, lines in of_language("yaml"):
+def test_yaml_and_xml_blocks_are_valid():
+    for _, lines in blocks_in("yaml"):
         assert yaml.safe_load("\n".join(lines))
-    for _, lines in of_language("xml"):
+    for _, lines in blocks_in("xml"):
         ElementTree.fromstring("\n".join(lines))

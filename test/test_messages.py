@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""All messages of tools and nodes, as the page docs/messages.md lists them, have the same form."""
+"""All messages of tools and nodes, as listed in docs/messages.md, follow the style rules."""
 
 import re
 import subprocess
@@ -23,13 +23,13 @@ FAULTS = {
 }  # fmt: skip
 
 
-def test_the_page_of_messages_matches_the_code():
+def test_messages_page_matches_the_code():
     script = [sys.executable, ROOT / "scripts" / "messages.py"]
     made = subprocess.run(script, capture_output=True, text=True, check=True).stdout
     assert made == PAGE, "python scripts/messages.py > docs/messages.md"
 
 
 @pytest.mark.parametrize("fault", FAULTS)
-def test_no_message_has(fault):
+def test_no_message_has_style_fault(fault):
     assert len(MESSAGES) > 400
     assert [one for one in MESSAGES if re.search(FAULTS[fault], one)] == []

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The documentation as its readers meet it: one index, every page within a telephone's width."""
+"""The built documentation: one index, and every page fits the width of a telephone."""
 
 import re
 import subprocess
@@ -15,7 +15,7 @@ pytest.importorskip("furo", reason="the documentation's tools are not installed"
 ROOT = Path(__file__).resolve().parents[1]
 FIGURES = ROOT / "docs" / "figures"
 SIZE_OF_FIGURES = 1_000_000
-"""Bytes: a clone stays small."""
+"""Maximum size of all figures [bytes], so that a clone stays small."""
 
 
 @pytest.fixture(scope="module")
@@ -46,7 +46,7 @@ def test_index_holds_the_readme_and_every_section(site):
 
 
 @pytest.mark.parametrize("width", [390, 1280])
-def test_no_page_scrolls_sideways(site, browser, width):
+def test_no_page_scrolls_horizontally(site, browser, width):
     wide = {}
     pages = sorted(p for p in site.rglob("*.html") if "_static" not in p.parts)
     assert len(pages) > 30
@@ -60,7 +60,7 @@ def test_no_page_scrolls_sideways(site, browser, width):
     assert [url for url in browser.requests if not url.startswith(("file:", "data:"))] == []
 
 
-def test_figures_are_small_and_each_is_shown():
+def test_figures_are_small_and_all_shown():
     figures = [path for path in FIGURES.iterdir() if path.is_file()]
     assert sum(path.stat().st_size for path in figures) < SIZE_OF_FIGURES
     pages = [ROOT / "README.md", *(ROOT / "docs").rglob("*.md")]

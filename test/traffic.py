@@ -37,10 +37,10 @@ def raw(message: Any) -> bytes:
 
 
 def so_far(bag: Path) -> dict[str, list[bytes]]:
-    """Read a bag that is being written; in the middle of a write its end may be of two flushes."""
+    """Read a bag that is being written; its end may be torn in the middle of a write."""
     try:
         return contents(bag)
-    except Exception:  # whatever a reader stumbles over in a torn file: look again
+    except Exception:  # any error of a reader in a torn file: look again
         return {}
 
 
@@ -67,5 +67,5 @@ def publish_steadily(publishers, count, rate, make=state):
         data = raw(make(k))
         sent.append(data)
         for publisher in publishers:
-            publisher.publish(data)  # the bytes that lie between aligned fields are random
+            publisher.publish(data)  # padding bytes between aligned fields are random
     return sent

@@ -44,7 +44,7 @@ def two_wheeled(folder: Path) -> tuple[Path, Path]:
 
 
 class Relay:
-    """Passes one wheel's feedback on, as it is or with a fault."""
+    """Relays one wheel's feedback, unchanged or with an injected fault."""
 
     def __init__(self, robot, wheel):
         self.robot = robot
@@ -110,7 +110,7 @@ class Relay:
 
 
 class WheelRobot(DomainNode):
-    """Publish set-points while spinning and store the wheels' states, of a robot's namespace."""
+    """Publishes set-points while spinning and stores the wheels' states in a namespace."""
 
     def __init__(self, domain: int, space: str = "") -> None:
         super().__init__(domain, "robot")
@@ -163,7 +163,7 @@ class WheelRobot(DomainNode):
         self.feedback[wheel].publish(message)
 
     def velocity(self, wheel: str, samples: int = 20) -> float:
-        """Mean speed over the last samples, by position; NaN before there are some."""
+        """Return the mean speed over the last samples, by position; NaN while there are too few."""
         last = self.states[wheel][-samples:]
         if len(last) < samples:
             return math.nan
@@ -171,14 +171,14 @@ class WheelRobot(DomainNode):
         return (last[-1].position - last[0].position) / (stamps[-1] - stamps[0])
 
     def named(self, node: str, text: str, since: float = 0.0) -> bool:
-        """Tell whether a node has said something on /diagnostics since an instant."""
+        """Return whether a node has reported a text on /diagnostics since an instant."""
         return any(t >= since and n == node and text in m for t, n, _, m in self.diagnoses)
 
     def last_diagnosis(self, node: str) -> str:
         return next((m for _, n, _, m in reversed(self.diagnoses) if n == node), "")
 
     def set(self, node: str, **values: object) -> tuple[bool, str]:
-        """Set parameters as one; names have __ for a dot."""
+        """Set parameters atomically; names have __ for a dot."""
         parameters = [
             Parameter(name.replace("__", "."), value=value).to_parameter_msg()
             for name, value in values.items()
@@ -198,7 +198,7 @@ class WheelRobot(DomainNode):
         return str(self._call(Trigger, f"/{node}/{service}", Trigger.Request()).message)
 
     def _call(self, kind: object, name: str, request: object) -> object:
-        # Kept: a client must be discovered anew each time that it is made.
+        # Clients are stored, as each new one must be discovered again.
         if name not in self._clients:
             self._clients[name] = self.node.create_client(kind, name)
         client = self._clients[name]

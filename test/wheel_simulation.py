@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One wheel in open and closed loop without ROS, made of the parts that run on the robot."""
+"""One wheel in open and closed loop without ROS, simulated with the robot's components."""
 
 import math
 import random
@@ -17,7 +17,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, kw_only=True)
 class Timing:
-    """When samples are taken and, ``delay`` later, their commands arrive [s]."""
+    """Times of samples, and of their commands, which arrive ``delay`` later [s]."""
 
     sample_time: float = 0.005
     delay: float = 0.0

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One wheel under its controller, with time passed in and faults to inject.
+"""One wheel under its controller, with simulated time and injected faults.
 
-The motor is the tests' own: first order, 0.36 rad/s per volt at the wheel, 50 ms; 100 Hz.
+The motor is of first order: 0.36 rad/s per volt at the wheel, 50 ms, sampled at 100 Hz.
 """
 
 import math
@@ -35,7 +35,7 @@ class Sample:
 
 
 class World:
-    """A wheel under control; faults are put in between."""
+    """A wheel under its controller, with faults injected between plant and controller."""
 
     def __init__(self, settings: WheelSettings = SETTINGS) -> None:
         self.wheel = WheelController(settings)
@@ -45,7 +45,7 @@ class World:
         self.sensor: Callable[[Sample], Sample | None] = lambda sample: sample
         self.stamp: Callable[[int], int] = lambda stamp: stamp
         self.blocked = False
-        self.load = 0.0  # that pushes the wheel forward [V]
+        self.load = 0.0  # pushes the wheel forward [V]
         self.log: list[tuple[float, float, float]] = []  # time, voltage, true speed
         self.wheel.activate(self.now)
 
@@ -86,8 +86,8 @@ class World:
         return self.now - begin
 
 
-def change(**fields: object) -> Callable[[World], None]:
-    """Return a fault that changes fields of the feedback; a callable makes them of the old."""
+def change_feedback(**fields: object) -> Callable[[World], None]:
+    """Return a fault that changes feedback fields; a callable computes the new value."""
 
     def put(world: World) -> None:
         def sensor(sample: Sample) -> Sample:
@@ -99,30 +99,30 @@ def change(**fields: object) -> Callable[[World], None]:
     return put
 
 
-def lose(world: World) -> None:
+def lose_feedback(world: World) -> None:
     world.sensor = lambda sample: None
 
 
-def delay(world: World) -> None:
+def delay_feedback(world: World) -> None:
     world.stamp = lambda stamp: stamp - 500_000_000
 
 
-def block(world: World) -> None:
+def block_wheel(world: World) -> None:
     world.blocked = True
 
 
-def silent(world: World) -> None:
+def stop_set_points(world: World) -> None:
     world.setpoint = None
 
 
-def asking(value: float) -> Callable[[World], None]:
+def send_set_point(value: float) -> Callable[[World], None]:
     return lambda world: setattr(world, "setpoint", value)
 
 
-def taken(world: World) -> None:
+def set_other_owner(world: World) -> None:
     world.wheel.owner = "/excite#1"
 
 
-def sensible(world: World) -> None:
+def clear_faults(world: World) -> None:
     world.sensor, world.stamp = (lambda sample: sample), (lambda stamp: stamp)
     world.blocked, world.setpoint, world.wheel.owner = False, 1.5, ""

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Every field of every message says in what unit it is, and every message is built."""
+"""Every field of every message has a comment and unit, and every message is built."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ MESSAGES = sorted((PACKAGE / "msg").glob("*.msg"))
 
 
 @pytest.mark.parametrize("path", MESSAGES, ids=lambda path: path.stem)
-def test_every_field_has_a_comment_and_every_number_its_unit(path):
+def test_every_field_has_a_comment_and_every_float_a_unit(path):
     text = path.read_text(encoding="utf-8")
     assert text.startswith("# ")
     for line in text.splitlines():
@@ -25,6 +25,6 @@ def test_every_field_has_a_comment_and_every_number_its_unit(path):
             assert re.match(r"\s*\[.+\]", comment), f"{path.name}: {line}: no unit"
 
 
-def test_every_message_is_built():
+def test_every_message_is_listed_in_cmake():
     built = re.findall(r"msg/(\w+)\.msg", (PACKAGE / "CMakeLists.txt").read_text())
     assert built == [path.stem for path in MESSAGES]

@@ -48,7 +48,7 @@ def settings(**gains: object) -> LoopSettings:
         ({"u_clamp_min": 13.0, "u_clamp_max": 14.0}, "u_clamp_m"),
     ],
 )
-def test_gains_that_make_no_sense_are_refused_with_the_limit_and_by_how_much(gains, words):
+def test_invalid_or_unstable_gains_are_refused_with_limit_and_excess(gains, words):
     with pytest.raises(ParameterError, match=words):
         check(settings(**gains), WHEEL)
 
@@ -57,19 +57,19 @@ def test_gains_that_make_no_sense_are_refused_with_the_limit_and_by_how_much(gai
     "gains",
     [{}, {"p": 0.0, "i": 0.0}, {"p": 5.0}, {"feedforward_velocity": 0.0}, {"setpoint_weight_p": 0}],
 )
-def test_gains_that_drive_the_motor_are_accepted(gains):
+def test_stable_gains_are_accepted(gains):
     check(settings(**gains), WHEEL)
     check(settings(**gains))
 
 
-QUIET = dict(i=0.0, feedforward_velocity=0.0, feedforward_acceleration=0.0)
-"""A proportional action alone."""
+P_ONLY = dict(i=0.0, feedforward_velocity=0.0, feedforward_acceleration=0.0)
+"""Proportional action only."""
 
 
-def limit(dt: float, late: int = 1) -> float:
-    """Return the largest p, alone on a motor of first order whose voltage acts so much later.
+def largest_stable_p(dt: float, late: int = 1) -> float:
+    """Return the largest stable p for a first-order motor with a delay of ``late`` samples.
 
-    By the test's own recursion: mean speed over a sample, as the hardware shows it.
+    The test's own recursion, with the mean speed over a sample as measurement.
     """
     decay = math.exp(-dt / TAU)
 
@@ -92,40 +92,40 @@ def limit(dt: float, late: int = 1) -> float:
 
 
 @pytest.mark.parametrize(("delay", "late"), [(0.0, 1), (0.005, 2), (0.006, 3), (0.01, 3)])
-def test_limit_of_stability_is_that_of_the_sampled_loop(delay, late):
-    # Within 3 %: so near to the limit nothing grows visibly in the samples of the trial.
-    largest, model = limit(0.005, late), replace(MODEL, delay=delay)
-    check(replace(settings(p=0.97 * largest, **QUIET), model=model), WHEEL)
+def test_stability_limit_matches_sampled_loop_with_delay(delay, late):
+    # Within 3 %: closer to the limit, growth is not visible within the trial.
+    largest, model = largest_stable_p(0.005, late), replace(MODEL, delay=delay)
+    check(replace(settings(p=0.97 * largest, **P_ONLY), model=model), WHEEL)
     with pytest.raises(ParameterError, match="unstable"):
-        check(replace(settings(p=1.03 * largest, **QUIET), model=model), WHEEL)
+        check(replace(settings(p=1.03 * largest, **P_ONLY), model=model), WHEEL)
 
 
-def test_refusal_names_the_excess_and_the_interval():
-    largest = limit(0.005)
+def test_refusal_states_stable_gain_ratio_and_sample_interval():
+    largest = largest_stable_p(0.005)
     with pytest.raises(ParameterError, match=r"stable with [\d.]+ times these") as refused:
-        check(settings(p=4 * largest, **QUIET), WHEEL)
+        check(settings(p=4 * largest, **P_ONLY), WHEEL)
     share = float(str(refused.value).split("stable with ")[1].split()[0])
     assert 0.25 - 1 / 32 - 0.01 < share < 0.26
     assert abs(32 * share - round(32 * share)) < 0.17  # five halvings, printed with two digits
     with pytest.raises(ParameterError, match="lower them by far"):
-        check(settings(p=100 * largest, **QUIET), WHEEL)
+        check(settings(p=100 * largest, **P_ONLY), WHEEL)
     named = {1e-9: "0.1 ms", 0.02: "20 ms", 7.0: r"1e\+03 ms", math.nan: "1 ms"}
     for given, words in named.items():
         with pytest.raises(ParameterError, match=f"intervals of {words}"):
             check(settings(i=5e6), replace(WHEEL, sample_time=given))
 
 
-def test_before_the_rate_is_known_one_of_the_usual_must_do():
-    largest = limit_with_winding(0.001)
-    check(settings(p=0.985 * largest, **QUIET), replace(WHEEL, sample_time=math.nan))
+def test_gains_must_be_stable_at_one_common_rate_while_rate_is_unknown():
+    largest = largest_stable_p_with_inductance(0.001)
+    check(settings(p=0.985 * largest, **P_ONLY), replace(WHEEL, sample_time=math.nan))
     with pytest.raises(ParameterError, match="unstable"):
-        check(settings(p=1.03 * largest, **QUIET), replace(WHEEL, sample_time=math.nan))
+        check(settings(p=1.03 * largest, **P_ONLY), replace(WHEEL, sample_time=math.nan))
 
 
-def limit_with_winding(dt: float) -> float:
-    """Return the largest p, where a motor of first order has a winding of a thousandth of its lag.
+def largest_stable_p_with_inductance(dt: float) -> float:
+    """Return the largest stable p, with an electrical time constant of a thousandth of tau.
 
-    The angle of a sample is that of ``tp w'' + tau w' + w = K u``, integrated once.
+    The angle follows from ``tp w'' + tau w' + w = K u``, integrated once.
     """
     step, tp = exact_step(MODEL, RATIO, dt), 1e-3 * TAU * TAU
     low, high = 0.1, 5000.0
@@ -147,7 +147,7 @@ def limit_with_winding(dt: float) -> float:
     ("factor", "static", "reached"),
     [(2.1, 0.0, 2.1), (6.0, 0.0, 5.0), (3.0, 1.0, (3.0 * 2.2 - 1.0) / 2.2)],
 )
-def test_feed_forward_of_another_motor_is_refused_with_its_speed(factor, static, reached):
+def test_excessive_feed_forward_is_refused_with_speed_it_reaches(factor, static, reached):
     # Feed-forward alone for a fifth of the speed at 12 V less friction; at most those 12 V.
     given = settings(p=0.0, i=0.0, feedforward_velocity=factor * RATIO / GAIN,
                      feedforward_acceleration=0.0)  # fmt: skip
@@ -156,12 +156,12 @@ def test_feed_forward_of_another_motor_is_refused_with_its_speed(factor, static,
         check(replace(given, model=model), WHEEL)
     said = float(str(refused.value).split("reaches ")[1].split()[0])
     assert said == pytest.approx(reached, rel=0.01)
-    if not static:  # a slow wheel's, too
+    if not static:  # also with a low velocity limit
         with pytest.raises(ParameterError, match=f"reaches {reached if factor < 5 else factor:g} "):
             check(replace(given, limits=ProfileLimits(velocity=0.01)), WHEEL)
 
 
-def test_set_point_of_the_trial_is_a_fifth_of_the_range_of_clamps_and_12_v():
+def test_trial_set_point_needs_a_fifth_of_smaller_clamp_limited_to_12_v():
     double = dict(p=0.0, i=0.0, feedforward_acceleration=0.0)
     weak = settings(feedforward_velocity=2.1 * RATIO / GAIN, u_clamp_min=-3.0, u_clamp_max=5.0,
                     **double)  # fmt: skip
@@ -173,19 +173,19 @@ def test_set_point_of_the_trial_is_a_fifth_of_the_range_of_clamps_and_12_v():
         check(strong, replace(WHEEL, supply=24.0))
 
 
-def test_speed_that_is_differenced_over_many_samples_is_tried_with_its_delay():
+def test_trial_includes_delay_of_difference_window():
     # A lag of half of 20 samples, in addition to the loop's 1.5, reduces the limit of p.
-    largest = limit(0.005)
+    largest = largest_stable_p(0.005)
     counted = replace(WHEEL, encoder=Encoder(counts_per_revolution=4000.0))
-    late = replace(settings(p=0.6 * largest, **QUIET), speed_source="difference")
+    late = replace(settings(p=0.6 * largest, **P_ONLY), speed_source="difference")
     check(replace(late, difference_window=1), counted)
     with pytest.raises(ParameterError, match="times the set-point"):
         check(replace(late, difference_window=20), counted)
 
 
-def test_slow_motor_is_looked_at_for_as_long_as_it_takes():
-    # An integral alone on tau = 3 s, 0.1 s late, swings with a period of seconds: the largest i
-    # is where the phase of 1/(s (1 + tau s)) e^(-D s) is -180 deg; delay, hold and mean included.
+def test_trial_of_slow_motor_is_long_enough_to_show_instability():
+    # Integral action on tau = 3 s with 0.1 s of delay oscillates with a period of seconds. At the
+    # largest i the phase of 1/(s (1 + tau s)) e^(-D s), with hold and averaging, is -180 deg.
     tau, dt, delay = 3.0, 0.005, 0.1
     total = delay + 2 * dt
     low, high = 0.1, 10.0
@@ -195,14 +195,14 @@ def test_slow_motor_is_looked_at_for_as_long_as_it_takes():
         low, high = (low, middle) if beyond else (middle, high)
     gain = low * math.hypot(1.0, low * tau) * RATIO / GAIN
     model = replace(MODEL, time_constant=tau, delay=delay)
-    alone = dict(QUIET, p=0.0)
+    alone = dict(P_ONLY, p=0.0)
     check(replace(settings(**{**alone, "i": 0.85 * gain}), model=model), WHEEL)
     with pytest.raises(ParameterError, match="unstable"):
         check(replace(settings(**{**alone, "i": 1.1 * gain}), model=model), WHEEL)
 
 
-def test_feed_forward_that_tells_the_motor_is_its_model():
-    largest = limit(0.005)
+def test_motor_model_is_derived_from_feed_forward_when_missing():
+    largest = largest_stable_p(0.005)
     given = settings(p=0.7 * largest, i=0.0, setpoint_weight_p=0.0)
     check(replace(given, model=None), WHEEL)
     with pytest.raises(ParameterError, match="unstable"):
@@ -212,7 +212,7 @@ def test_feed_forward_that_tells_the_motor_is_its_model():
         check(replace(small, model=None), WHEEL)
 
 
-def test_arithmetic_that_fails_is_refused_in_words(monkeypatch):
+def test_numerical_failure_is_reported_as_parameter_error(monkeypatch):
     def fails(*_: object) -> None:
         raise np.linalg.LinAlgError("singular")
 
@@ -221,7 +221,7 @@ def test_arithmetic_that_fails_is_refused_in_words(monkeypatch):
         check(LoopSettings(gains=GAINS))
 
 
-def test_non_finite_output_is_refused_for_any_motor(monkeypatch):
+def test_non_finite_output_is_refused_without_motor_model(monkeypatch):
     nothing = PidOutput(*[math.nan] * 6, False)
     monkeypatch.setattr(WheelLoop, "step", lambda *_: nothing)
     with pytest.raises(ParameterError, match="reaches nan times"):
@@ -237,7 +237,7 @@ def test_feed_forward_of_almost_twice_the_needed_voltage_is_accepted():
                    feedforward_acceleration=0.0), WHEEL)  # fmt: skip
 
 
-def test_motor_is_known_by_its_model_and_gearing_or_by_the_feed_forward():
+def test_stability_check_needs_model_and_gear_ratio_or_feed_forward():
     swinging, nobody = settings(i=1e5), replace(WHEEL, gearbox=None)
     known = [
         (swinging, WHEEL),
@@ -263,7 +263,7 @@ def test_motor_is_known_by_its_model_and_gearing_or_by_the_feed_forward():
         ("setpoint_weight_p", 0.0, 1.0), ("setpoint_weight_d", 0.0, 1.0),
     ],
 )  # fmt: skip
-def test_gains_beyond_any_supply_are_refused_and_those_at_the_border_are_not(name, least, most):
+def test_gain_bounds_are_inclusive_and_refusal_states_excess(name, least, most):
     bounded = PidGains(u_clamp_min=-SUPPLY, u_clamp_max=SUPPLY)
     for value in (least, most):
         check(LoopSettings(gains=replace(bounded, **{name: value})))
@@ -274,7 +274,7 @@ def test_gains_beyond_any_supply_are_refused_and_those_at_the_border_are_not(nam
         assert float(str(refused.value).rsplit(" ", 1)[1]) == pytest.approx(beyond, rel=1e-5)
 
 
-def test_gains_that_suit_a_faster_loop_alone_wait_for_its_rate():
+def test_gains_for_fast_loop_are_accepted_until_slow_rate_is_known():
     fast = settings(p=40.0, i=0.0)
     check(fast)
     check(fast, replace(WHEEL, sample_time=0.001))
@@ -282,8 +282,8 @@ def test_gains_that_suit_a_faster_loop_alone_wait_for_its_rate():
         check(fast, replace(WHEEL, sample_time=0.02))
 
 
-def extreme(draw: random.Random, usual: float) -> float:
-    """Return a number around a usual one, or one at the boundary of all numbers."""
+def draw_extreme(draw: random.Random, usual: float) -> float:
+    """Return a random number around a usual one, or an extreme floating-point number."""
     if draw.random() < 0.12:
         return draw.choice([0.0, 5e-324, 1e-300, 1.7e308, -1.7e308, 1e9, math.nan, math.inf])
     value = usual * 10.0 ** draw.gauss(0.0, 1.0)
@@ -297,32 +297,34 @@ def random_settings(draw: random.Random) -> LoopSettings:
         "setpoint_weight_d": 0.2, "derivative_filter_time_constant": 0.005,
         "feedforward_static": 0.4, "feedforward_velocity": 2.6, "feedforward_acceleration": 0.1,
     }  # fmt: skip
-    chosen = {k: extreme(draw, v) for k, v in usual.items() if draw.random() < 0.5}
+    chosen = {k: draw_extreme(draw, v) for k, v in usual.items() if draw.random() < 0.5}
     for name in ("u_clamp", "i_clamp"):
         if f"{name}_max" in chosen:
             chosen[f"{name}_min"] = -chosen[f"{name}_max"]
     gains = PidGains(**chosen, antiwindup_strategy=draw.choice(STRATEGIES))
     some = [f.name for f in fields(ObserverNoise)]
-    noise = ObserverNoise(**{n: extreme(draw, 0.3) for n in some if draw.random() < 0.3})
+    noise = ObserverNoise(**{n: draw_extreme(draw, 0.3) for n in some if draw.random() < 0.3})
     model = MODEL
     if draw.random() < 0.3:
         model = MotorModel(
-            dc_gain=extreme(draw, GAIN),
-            time_constant=extreme(draw, TAU),
-            time_constant_product=extreme(draw, 8e-4),
-            static_voltage=extreme(draw, 0.4),
-            delay=extreme(draw, 0.005),
+            dc_gain=draw_extreme(draw, GAIN),
+            time_constant=draw_extreme(draw, TAU),
+            time_constant_product=draw_extreme(draw, 8e-4),
+            static_voltage=draw_extreme(draw, 0.4),
+            delay=draw_extreme(draw, 0.005),
         )
     drive = None
     if draw.random() < 0.2:
-        drive = Drive(top_speed=extreme(draw, 3.0), time_constant=extreme(draw, TAU),
-                      time_constant_product=extreme(draw, 8e-4))  # fmt: skip
+        drive = Drive(top_speed=draw_extreme(draw, 3.0), time_constant=draw_extreme(draw, TAU),
+                      time_constant_product=draw_extreme(draw, 8e-4))  # fmt: skip
     limits = ProfileLimits()
     if draw.random() < 0.3:
-        limits = ProfileLimits(acceleration=extreme(draw, 15.0), jerk=extreme(draw, 300.0))
+        limits = ProfileLimits(
+            acceleration=draw_extreme(draw, 15.0), jerk=draw_extreme(draw, 300.0)
+        )
     return LoopSettings(
         gains=gains, limits=limits, model=model, noise=noise, drive=drive,
-        transition_time=draw.choice([0.0, 0.2, abs(extreme(draw, 0.2))]),
+        transition_time=draw.choice([0.0, 0.2, abs(draw_extreme(draw, 0.2))]),
         reference_delay=draw.choice([0.0, 0.0075]),
         speed_source=draw.choice(SPEED_SOURCES),
         difference_window=draw.choice([1, 2, 4, 1000]),
@@ -330,10 +332,10 @@ def random_settings(draw: random.Random) -> LoopSettings:
 
 
 def exact_step(model: MotorModel, ratio: float, dt: float) -> np.ndarray:
-    """Return the transition of (speed, its rate) over a sample of held voltage, by a series.
+    """Return the transition of speed and acceleration over one sample of held voltage.
 
-    ``tp w'' + tau w' + w = K u`` as a matrix exponential: scaled, 12 terms, squared again; a motor
-    of first order has an electrical time constant of a thousandth of its own.
+    ``tp w'' + tau w' + w = K u`` as a matrix exponential: scaled, 12 terms, squared again; a
+    first-order motor has an electrical time constant of a thousandth of its own.
     """
     tau, tp = model.time_constant, model.time_constant_product
     tp = max(tp, 1e-3 * tau * tau)
@@ -348,8 +350,8 @@ def exact_step(model: MotorModel, ratio: float, dt: float) -> np.ndarray:
     return result[:2]
 
 
-def drives(given: LoopSettings, ratio: float) -> float:
-    """Return the largest speed of the identified motor with accepted settings, in set-points."""
+def simulate_overshoot(given: LoopSettings, ratio: float) -> float:
+    """Return the peak speed of the motor under accepted settings, relative to the set-point."""
     model, dt = given.model, 0.005
     loop = WheelLoop(given.clamp_to_supply(SUPPLY))
     loop.start(0.0)
@@ -367,28 +369,28 @@ def drives(given: LoopSettings, ratio: float) -> float:
 
 
 def accepted_sets(draw: random.Random, count: int):
-    """Yield the accepted ones of random settings, and the overshoot of each."""
+    """Yield accepted random settings with their relative peak speed."""
     for _ in range(count):
         try:
             given = random_settings(draw)
             check(given, WHEEL)
         except ParameterError:
             continue
-        yield given, drives(given, RATIO)
+        yield given, simulate_overshoot(given, RATIO)
 
 
 @pytest.mark.parametrize("seed", range(6))
-def test_random_settings_are_refused_in_words_or_drive_no_faster_than_twice_the_set_point(seed):
+def test_random_settings_are_refused_or_stay_below_2_5_times_set_point(seed):
     accepted = list(accepted_sets(random.Random(seed), 50))
     for given, share in accepted:
-        # The full voltage gives five set-points; a quarter more than is accepted, as this motor
-        # has no encoder, no jitter, and half a sample less of delay.
+        # The full voltage gives five set-points. The bound is a quarter above the accepted one:
+        # this motor has no encoder, no jitter, and half a sample less of delay.
         assert share < 2.5, given
     assert accepted
 
 
-def test_a_slow_integral_overshoots_for_long_and_is_stable():
-    """A crossover of 5 rad/s, so that the motor's own four time constants end in the overshoot."""
+def test_long_overshoot_of_slow_integral_is_not_taken_for_instability():
+    """At a crossover of 5 rad/s, four motor time constants pass before the overshoot ends."""
     motor = MotorModel(dc_gain=0.2766, time_constant=0.0702, static_voltage=0.76)
     gains = PidGains(
         p=0.535, i=19.8, u_clamp_min=-24.0, u_clamp_max=24.0, feedforward_static=0.76,
@@ -402,7 +404,7 @@ def test_a_slow_integral_overshoots_for_long_and_is_stable():
         check(replace(slow, gains=replace(gains, i=2e4)), circumstances)
 
 
-def test_gains_for_a_filtered_speed_are_tried_behind_its_filter():
+def test_trial_includes_speed_filter_implied_by_reference_delay():
     motor = MotorModel(dc_gain=0.906, time_constant=0.059, static_voltage=0.16)
     gains = PidGains(
         p=3.545, i=33.2, d=0.188, u_clamp_min=-12.0, u_clamp_max=12.0,

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""No motor and no period ends a running loop."""
+"""The loop's output stays finite for random motors and sample intervals."""
 
 import math
 
@@ -17,7 +17,7 @@ from smp_motor_control.reference.profile import Drive
 from smp_motor_control.wheel.loop import LoopSettings, WheelLoop
 
 GEARBOX, ENCODER = Gearbox(30.0), Encoder(500.0)
-STEPS = 60  # 20 of them are the observer's learning of the interval
+STEPS = 60  # the observer learns the interval in the first 20
 
 
 def log_uniform(rng: np.random.Generator, low: float, high: float) -> float:
@@ -35,7 +35,7 @@ def random_model(rng: np.random.Generator, tau: float, electrical: float) -> Mot
 
 
 def model_based_settings(model: MotorModel, supply: float, bandwidth: float) -> LoopSettings:
-    """Gains that place a pole at the bandwidth, with the motor's own equation fed forward."""
+    """Return gains that place a pole at the bandwidth, with model-based feed-forward."""
     a0, tau = GEARBOX.ratio / model.dc_gain, model.time_constant
     gains = PidGains(
         p=a0 * tau * bandwidth, i=a0 * bandwidth, u_clamp_min=-supply, u_clamp_max=supply,
@@ -52,7 +52,7 @@ def model_based_settings(model: MotorModel, supply: float, bandwidth: float) -> 
 
 
 def drive_a_wheel(settings, entry, dt, setpoint, steps=STEPS):
-    """Run a loop on its motor; return the largest voltage that it asked for."""
+    """Run a loop on its motor; return the largest commanded voltage."""
     plant = DrivenMotor(entry, DriveSettings(command_timeout=math.inf))
     loop = WheelLoop(
         settings.clamp_to_supply(entry.supply_voltage), entry.gearbox, entry.encoder, 18.0
@@ -77,7 +77,7 @@ def entry_of(model: MotorModel, supply: float) -> MotorEntry:
     return MotorEntry(parameters, GEARBOX, ENCODER, supply, delay=model.delay)
 
 
-def test_no_motor_at_any_rate_ends_its_loop():
+def test_loop_output_stays_finite_for_random_motors_and_rates():
     rng, supply = np.random.default_rng(7), 12.0
     for _ in range(60):
         electrical, dt = log_uniform(rng, 1e-5, 1e-2), log_uniform(rng, 2e-4, 5e-2)
@@ -89,7 +89,7 @@ def test_no_motor_at_any_rate_ends_its_loop():
 
 
 @pytest.mark.parametrize("electrical", [1e-5, 1e-4, 1e-3])
-def test_a_fast_electrical_pole_costs_the_observer_nothing(electrical):
+def test_observer_loop_stays_finite_with_fast_electrical_pole(electrical):
     # At 20 Hz L/R of 10 us has decayed by exp(-5000) within a sample.
     rng = np.random.default_rng(9)
     model = random_model(rng, 0.1, electrical)

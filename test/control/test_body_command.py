@@ -8,7 +8,7 @@ import pytest
 from smp_motor_control.body.command import BodyCommand, Verdict
 
 
-def test_nothing_is_asked_before_the_first_command_even_if_that_is_nan():
+def test_there_is_no_command_before_the_first_finite_one():
     command = BodyCommand()
     assert command.at(0.0) is None
     assert command.receive(math.nan, 0.0, 0.0, 0.0) is Verdict.NOT_FINITE
@@ -31,7 +31,7 @@ DRIVES, STOPS = (1.0, 0.0), (0.0, 0.0)
         (0.5, -3600.0, Verdict.ACCEPTED, {10.51: STOPS}),  # a stamp from the future
     ],
 )
-def test_command_of_an_age_holds_until_its_timeout(timeout, age, verdict, asked):
+def test_command_age_counts_towards_time_out(timeout, age, verdict, asked):
     command = BodyCommand(timeout)
     assert command.receive(*DRIVES, age, 10.0) is verdict
     assert {at: command.at(at) for at in asked} == asked

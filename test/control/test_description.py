@@ -12,7 +12,7 @@ from smp_motor_control.body.description import robot_description
 @pytest.mark.parametrize(
     ("left", "right"), [(LEFT, RIGHT), (("left",), ("right",)), (("a", "b", "c"), ("d", "e", "f"))]
 )
-def test_every_wheel_has_its_joint_on_its_side(left, right):
+def test_urdf_has_one_joint_per_wheel_on_its_side(left, right):
     robot = ElementTree.fromstring(robot_description(left, right, separation=0.3, radius=0.05))
     joints = {joint.attrib["name"]: joint for joint in robot.iter("joint")}
     assert list(joints) == [get_joint_name(wheel) for wheel in (*left, *right)]

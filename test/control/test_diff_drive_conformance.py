@@ -37,7 +37,7 @@ FUNCTIONS = {
     "limit_first_derivative": "limit_acceleration",
     "limit_second_derivative": "limit_jerk",
 }
-"""Names of control_toolbox's rate_limiter, and those of a speed's."""
+"""Names of control_toolbox's rate_limiter, and those of SpeedLimiter."""
 
 
 def limiter_of(limits: dict[str, float | None]) -> SpeedLimiter:
@@ -49,7 +49,7 @@ def cases(name: str):
 
 
 @cases("rate_limiter_cases")
-def test_limiter_gives_value_and_factor(case):
+def test_rate_limiter_returns_limited_value_and_factor(case):
     limiter = limiter_of(case["limits"])
     arguments = [case[name] for name in ("v", "v0", "v1", "dt") if case[name] is not None]
     value, factor = getattr(limiter, FUNCTIONS[case["function"]])(*arguments)
@@ -58,20 +58,20 @@ def test_limiter_gives_value_and_factor(case):
 
 
 @cases("rate_limiter_invalid")
-def test_limits_out_of_order_are_refused(case):
+def test_minimum_above_maximum_is_refused(case):
     with pytest.raises(ParameterError, match="minimum"):
         limiter_of(case["limits"])
 
 
 @cases("rate_limiter_valid")
 @pytest.mark.parametrize("absent", [None, math.nan])
-def test_limits_that_are_not_given_are_accepted(case, absent):
+def test_missing_limits_are_accepted(case, absent):
     limits = {name: absent if x is None else x for name, x in case["limits"].items()}
     assert math.isfinite(limiter_of(limits).limit(10.0, 0.0, 0.0, 0.1).value)
 
 
 @cases("inverse_kinematics_cases")
-def test_body_velocity_becomes_wheel_speeds_and_back(case):
+def test_forward_and_inverse_kinematics_match_reference_cases(case):
     names = ("wheel_separation", "wheel_separation_multiplier", "wheel_radius",
              "left_wheel_radius_multiplier", "right_wheel_radius_multiplier")  # fmt: skip
     robot = SkidSteer(**{name: case[name] for name in names})
@@ -83,7 +83,7 @@ def test_body_velocity_becomes_wheel_speeds_and_back(case):
 
 
 @pytest.mark.parametrize("case", CASES["linorobot_kinematics_cases"])
-def test_wheels_stay_within_their_reach(case):
+def test_wheel_speeds_are_limited_to_maximum(case):
     to_rpm = 30.0 / math.pi
     robot = SkidSteer(
         wheel_separation=case["track"],
@@ -108,17 +108,17 @@ def apply(odometry: Odometry, update: dict) -> bool | None:
 
 
 @cases("odometry_cases")
-def test_odometry_ends_where_the_wheels_lead(case):
+def test_odometry_matches_reference_cases(case):
     names = ("wheel_separation", "left_radius", "right_radius", "window")
     odometry = Odometry(**{name: case[name] for name in names})
     expected = dict(case["expect"])
     if any(update["type"] == "wheel_position" for update in case["updates"]):
         if case["id"] == "first_position_offset_gotcha":
-            # A known fault there: the first reading is never motion here.
+            # A known fault of diff_drive_controller: here the first reading adds no motion.
             assert not apply(odometry, case["updates"][0])
             assert odometry.x == 0.0
             return
-        # Their test assumes wheels at 0.
+        # The reference test assumes wheels at 0.
         odometry.update_from_position(0.0, 0.0, 1.0)
     for update in case["updates"]:
         for _ in range(update.get("repeat", 1)):
@@ -128,7 +128,7 @@ def test_odometry_ends_where_the_wheels_lead(case):
         assert getattr(odometry, name) == pytest.approx(value, abs=case["abs_tol"]), name
 
 
-def test_speed_limiter_reaches_each_speed_on_the_very_update():
+def test_speed_limiter_reaches_target_at_the_expected_update():
     case = CASES["controller_speed_limiter"]
     prefix = "linear.x."
     limiter = SpeedLimiter(

@@ -17,7 +17,7 @@ from smp_motor_control.errors import ParameterError
     steps=st.lists(st.floats(-0.49, 0.49), min_size=1, max_size=50),
     start=st.integers(-(2**40), 2**40),
 )
-def test_unwrapping_undoes_wrapping_while_steps_stay_below_half_the_range(bits, steps, start):
+def test_unwrapping_inverts_wrapping_for_steps_below_half_the_range(bits, steps, start):
     moved = np.array([int(s * 2**bits) for s in steps], dtype=object)
     total = [start, *(start + np.cumsum(moved))]
     shown = [wrap(int(c), bits) for c in total]
@@ -35,26 +35,26 @@ def test_unsigned_counters_unwrap_like_signed_ones(bits):
     assert np.array_equal(np.diff(unwrap(unsigned, bits)), np.diff(total))
 
 
-def test_count_is_the_angle_in_whole_counts_in_both_directions():
+def test_count_is_the_angle_rounded_down_to_whole_counts():
     encoder = Encoder(500.0)
     one = encoder.angle_per_count
     assert [encoder.count(k * one * 1.0001) for k in (0, 1, 250, 500)] == [0, 1, 250, 500]
     assert encoder.count(-0.5 * one) == -1
 
 
-def test_a_window_of_no_sample_is_refused():
+def test_window_of_zero_samples_is_refused():
     with pytest.raises(ParameterError, match="window"):
         DifferencedSpeed(Encoder(), 0)
 
 
 @pytest.mark.parametrize("bits", [2, 8, 16, 63])
-def test_a_counter_shows_twos_complement_at_the_ends_of_its_range(bits):
+def test_counter_wraps_in_twos_complement_at_range_ends(bits):
     half = 2 ** (bits - 1)
     shows = {half - 1: half - 1, half: -half, -half: -half, -half - 1: half - 1, 2 * half: 0}
     for count, expected in shows.items():
         assert wrap(count, bits) == expected
         assert wrap(count, 0) == count
-        # One step to there from zero, by the shortest way.
+        # One step from zero, along the shorter direction.
         for unwrapped in (Unwrapper(bits), Unwrapper(0)):
             assert unwrapped(0) == 0
         one = Unwrapper(bits)
@@ -64,13 +64,13 @@ def test_a_counter_shows_twos_complement_at_the_ends_of_its_range(bits):
 
 
 @pytest.mark.parametrize("bits", [-1, 1, 64, 2.5])
-def test_a_width_that_no_counter_has_is_refused_wherever_it_is_given(bits):
+def test_invalid_counter_width_is_refused(bits):
     for make in (lambda: Encoder(bits=bits), lambda: Unwrapper(bits), lambda: unwrap([0, 1], bits)):
         with pytest.raises(ParameterError, match="encoder_bits"):
             make()
 
 
-def test_counts_without_wraps_and_empty_ones_are_copied():
+def test_unwrap_copies_counts_without_wraps_and_empty_arrays():
     counts = np.array([0, 200, -300, 2**40])
     for bits, shown in ((0, counts), (8, counts[:0])):
         result = unwrap(shown, bits)
@@ -81,7 +81,7 @@ def test_counts_without_wraps_and_empty_ones_are_copied():
     assert unwrap([1], 8).tolist() == [1]
 
 
-def test_a_counter_that_is_reset_begins_where_it_stands():
+def test_unwrapper_starts_from_next_count_after_reset():
     one = Unwrapper(8)
     assert [one(c) for c in (100, 127, -128)] == [100, 127, 128]
     one.reset()
@@ -89,7 +89,7 @@ def test_a_counter_that_is_reset_begins_where_it_stands():
 
 
 @pytest.mark.parametrize("window", [1, 2, 5])
-def test_speed_is_the_count_over_exactly_its_window(window):
+def test_speed_is_the_count_difference_over_its_window(window):
     speed, counts = DifferencedSpeed(Encoder(64.0), window), [0, 3, 4, 4, 9, 2, 30, 31]
     assert speed.total == 0
     times = np.cumsum([0.5, 0.25, 0.125, 0.5, 1.0, 0.25, 0.125, 2.0])
@@ -111,7 +111,7 @@ def test_speed_is_the_count_over_exactly_its_window(window):
     assert value == pytest.approx(3.0 * 2.0 * math.pi / 64.0)
 
 
-def test_a_reset_forgets_counter_and_window():
+def test_reset_clears_counter_and_window():
     speed = DifferencedSpeed(Encoder(64.0, 8), window=2)
     speed.step(0.0, 100)
     speed.step(1.0, 120)
@@ -119,7 +119,7 @@ def test_a_reset_forgets_counter_and_window():
     assert math.isnan(speed.step(2.0, -100)) and speed.total == -100
 
 
-def test_counts_per_revolution_have_their_limits_and_their_default():
+def test_counts_per_revolution_has_default_and_accepts_its_limits():
     assert Encoder().counts_per_revolution == 500.0 and Encoder().bits == 0
     for value in (1e-3, 1e9):
         assert Encoder(value).angle_per_count == pytest.approx(2.0 * math.pi / value)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Excitation: bounded, never in step with the sampling, and rich."""
+"""Excitation signals: bounded, incommensurate with the sampling, and broadband."""
 
 import math
 
@@ -30,7 +30,7 @@ def test_signal_stays_within_its_amplitude_and_is_zero_before_it_starts(name):
 
 
 @pytest.mark.parametrize("name", SIGNALS)
-def test_signal_has_no_mean_that_would_drive_the_robot_away(name):
+def test_signal_has_zero_mean(name):
     signal = SIGNALS[name](amplitude=1.0)
     # Over 500 s random holds of 1 s average to 0.026 (one sigma); the rest averages better.
     assert abs(np.mean(signal(np.arange(0.0, 500.0, 0.005)))) < 0.08
@@ -38,8 +38,8 @@ def test_signal_has_no_mean_that_would_drive_the_robot_away(name):
 
 @pytest.mark.parametrize("rate", RATES)
 @pytest.mark.parametrize("kind", [Sine, Square])
-def test_period_is_far_from_every_whole_number_of_samples(kind, rate):
-    # Samples of a wave that repeats in step with the sampling fall on few phases.
+def test_period_is_incommensurate_with_sample_interval(kind, rate):
+    # Samples of a wave commensurate with the sampling cover few phases.
     phase = (np.arange(4000) / rate * math.sqrt(1.05)) % 1.0
     spacing = np.diff(np.sort(phase))
     assert spacing.max() < 4e-3
@@ -57,18 +57,18 @@ def test_tones_are_incommensurate_and_span_the_range():
         assert np.min(np.abs(ratios * whole - np.round(ratios * whole))) > 1e-5
 
 
-def test_multisine_keeps_a_low_crest_factor():
+def test_multisine_has_low_crest_factor():
     v = Fourier(amplitude=1.0)(np.arange(0.0, 60.0, 0.002))
     assert np.max(np.abs(v)) / np.std(v) < 2.4
 
 
-def test_seeds_give_signals_that_hardly_correlate():
+def test_signals_of_different_seeds_are_uncorrelated():
     time = np.arange(0.0, 120.0, 0.005)
     one, two = (Fourier(amplitude=1.0, seed=k)(time) for k in (0, 1))
     assert abs(np.corrcoef(one, two)[0, 1]) < 0.1
 
 
-def test_bounded_signal_fades_and_ends():
+def test_bounded_signal_fades_in_and_ends_at_its_duration():
     signal = Bounded(signal=Ramp(amplitude=5.0, period=1.0), duration=10.0, fade=1.0)
     time = np.linspace(0.0, 12.0, 12_001)
     v = signal(time)
@@ -88,6 +88,6 @@ def test_bounded_signal_fades_and_ends():
         lambda: Bounded(signal=Sine(amplitude=1.0), duration=1.0, fade=0.6),
     ],
 )
-def test_signal_that_makes_no_sense_is_refused(make):
+def test_invalid_signal_parameters_are_refused(make):
     with pytest.raises(ParameterError):
         make()

@@ -35,14 +35,14 @@ def test_any_other_key_stops_at_once(key):
 
 
 @pytest.mark.parametrize("key", BODY_KEYS)
-def test_body_keys_ask_for_their_share_of_both_speeds(key):
+def test_body_keys_scale_linear_and_angular_speed(key):
     keyboard = Keyboard(SPEEDS)
     keyboard.press(key, 0.0)
     linear, angular = BODY_KEYS[key]
     assert keyboard.body(0.0) == (linear * 0.2, angular * 0.6)
 
 
-def test_wheel_mode_drives_the_selected_wheels_alone():
+def test_wheel_mode_drives_only_selected_wheels():
     keyboard = Keyboard(SPEEDS)
     for key in ("m", "3", "s"):
         keyboard.press(key, 0.0)
@@ -59,7 +59,7 @@ def test_turning_keys_do_nothing_in_wheel_mode():
     assert not keyboard.driving(0.0)
 
 
-def test_speed_steps_are_bounded_and_undo_each_other():
+def test_speed_scale_is_bounded_and_steps_are_reversible():
     keyboard = Keyboard(SPEEDS)
     keyboard.press("+", 0.0)
     keyboard.press("-", 0.0)
@@ -84,5 +84,5 @@ def test_speed_steps_are_bounded_and_undo_each_other():
         ("", []),
     ],
 )
-def test_characters_are_taken_for_the_keys_that_send_them(text, keys):
+def test_terminal_characters_are_parsed_to_keys(text, keys):
     assert parse_keys(text) == keys

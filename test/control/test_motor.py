@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The motor compared with an independent integrator, and its friction."""
+"""The motor model compared with an independent integrator, and its friction."""
 
 import math
 
@@ -13,7 +13,7 @@ from smp_motor_control.motor import Gearbox, Motor, MotorParameters
 
 
 def reference_step(p: MotorParameters, state, voltage, dt, load):
-    """One interval by an adaptive integrator with events, mode by mode."""
+    """Return the state after one interval, by an adaptive integrator with friction events."""
     i, w, angle = state
     t = 0.0
 
@@ -35,7 +35,7 @@ def reference_step(p: MotorParameters, state, voltage, dt, load):
         def event(_, x, sign=sign, stuck=stuck):
             return abs(drive(x[0])) - p.coulomb_friction if stuck else x[1] * sign
 
-        event.terminal = True  # a short first step keeps the start from counting as a crossing
+        event.terminal = True  # a short first step, so that the start is no crossing
         event.direction = 1.0 if stuck else -1.0
         solution = solve_ivp(
             field, (t, dt), [i, w, angle], "DOP853", events=event, rtol=1e-11,
@@ -58,7 +58,7 @@ def random_case(rng: np.random.Generator):
 
 
 @pytest.mark.parametrize("seed", range(12))
-def test_step_equals_an_adaptive_integrator_through_sticking_and_reversal(seed):
+def test_step_matches_adaptive_integrator_through_stiction_and_reversal(seed):
     rng = np.random.default_rng(seed)
     p = random_case(rng)
     motor = Motor(p)
@@ -92,7 +92,7 @@ def test_one_long_step_equals_many_short_ones(wheel, inductance):
         assert parts.current == pytest.approx(whole.current, abs=1e-9)
 
 
-def test_underdamped_motor_that_dips_below_zero_inside_a_long_step_is_not_missed():
+def test_zero_crossing_of_underdamped_motor_within_long_step_is_detected():
     p = MotorParameters(
         resistance=0.5, inductance=0.5, motor_constant=0.05, inertia=1e-4,
         viscous_friction=0.0, coulomb_friction=1e-4,
@@ -116,7 +116,7 @@ def test_motor_sticks_below_the_static_voltage_and_turns_above(inductance):
     assert motor.speed > 0.0
 
 
-def test_load_below_friction_does_not_turn_a_resting_motor_and_above_it_does():
+def test_resting_motor_turns_only_under_load_above_friction():
     p = paper_motor("rear_left", static_voltage=0.5)
     motor = Motor(p)
     motor.step(0.0, 5.0, 0.99 * p.coulomb_friction)
@@ -134,17 +134,19 @@ def test_vanishing_inductance_approaches_zero_inductance():
     assert tiny.current == pytest.approx(none.current, rel=1e-6)
 
 
-def twin_of(p: MotorParameters) -> MotorParameters:
+def rebuild_from_combinations(p: MotorParameters) -> MotorParameters:
     return MotorParameters.from_combinations(**combinations_of(p), resistance=3.0)
 
 
-def test_combinations_survive_the_way_there_and_back():
+def test_parameter_combinations_round_trip():
     p = paper_motor("front_left", static_voltage=0.4)
     for name in ("a0", "a1", "a2", "static_voltage"):
-        assert getattr(twin_of(p), name) == pytest.approx(getattr(p, name), rel=1e-12)
+        assert getattr(rebuild_from_combinations(p), name) == pytest.approx(
+            getattr(p, name), rel=1e-12
+        )
 
 
-def test_motor_made_of_combinations_answers_a_voltage_like_the_original():
+def test_motor_from_parameter_combinations_has_original_response():
     # Exact without dry friction, and with it where there is no viscous friction.
     sliding = paper_motor("front_left")
     rubbing = MotorParameters(
@@ -152,7 +154,7 @@ def test_motor_made_of_combinations_answers_a_voltage_like_the_original():
         viscous_friction=0.0, coulomb_friction=0.005,
     )  # fmt: skip
     for p in (sliding, rubbing):
-        one, two = Motor(p), Motor(twin_of(p))
+        one, two = Motor(p), Motor(rebuild_from_combinations(p))
         for voltage in (7.0, -0.3, -5.0, 0.2):
             one.step(voltage, 0.05)
             two.step(voltage, 0.05)
@@ -160,7 +162,7 @@ def test_motor_made_of_combinations_answers_a_voltage_like_the_original():
 
 
 @pytest.mark.parametrize("bad", [(math.nan, 0.01, 0.0), (1.0, -0.01, 0.0), (1.0, 0.01, math.inf)])
-def test_step_with_nonsense_is_refused_and_leaves_the_motor_as_it_was(bad):
+def test_invalid_step_is_refused_and_leaves_state_unchanged(bad):
     motor = Motor(paper_motor("front_left"))
     motor.speed = 3.0
     with pytest.raises(ParameterError):
@@ -168,7 +170,7 @@ def test_step_with_nonsense_is_refused_and_leaves_the_motor_as_it_was(bad):
     assert motor.speed == 3.0
 
 
-def test_gearbox_converts_there_and_back_and_refuses_nonsense():
+def test_gearbox_conversion_round_trips_and_zero_ratio_is_refused():
     gearbox = Gearbox(65.5)
     assert gearbox.to_wheel(gearbox.to_motor(2.5)) == pytest.approx(2.5, rel=1e-15)
     with pytest.raises(ParameterError, match="gear ratio"):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Reading of motor files, and messages for invalid ones."""
+"""Motor files are read, and invalid ones are refused with a message."""
 
 from pathlib import Path
 
@@ -19,13 +19,13 @@ GOOD = """/motor_plant:
 """
 
 
-def file_of(tmp_path: Path, text: str) -> Path:
+def write_motor_file(tmp_path: Path, text: str) -> Path:
     path = tmp_path / "motors.yaml"
     path.write_text(text)
     return path
 
 
-def test_table_1_of_the_paper_is_in_the_configuration():
+def test_motor_configuration_matches_table_1_of_the_paper():
     motors = load_motors(PAPER, WHEELS)
     assert tuple(motors) == WHEELS
     first = motors["front_left"]
@@ -38,26 +38,28 @@ def test_table_1_of_the_paper_is_in_the_configuration():
     assert first.gearbox.ratio == 65.5 and first.encoder.counts_per_revolution == 500.0
 
 
-def test_numbers_without_a_decimal_point_are_numbers_as_ros_takes_them(tmp_path):
-    entry = load_motors(file_of(tmp_path, GOOD))["front_left"]
+def test_exponent_without_decimal_point_is_read_as_number(tmp_path):
+    entry = load_motors(write_motor_file(tmp_path, GOOD))["front_left"]
     assert entry.parameters.inertia == 1e-6
     assert entry.encoder.bits == 16 and entry.supply_voltage == 12.0
 
 
-def test_combinations_make_a_motor_whose_current_is_unknown(tmp_path):
+def test_motor_given_by_combinations_has_unknown_current(tmp_path):
     text = GOOD[: GOOD.index("front_left")] + (
         "front_left: {dc_gain: 25.0, time_constant: 0.05, static_voltage: 0.4, delay: 0.002}\n"
     )
-    entry = load_motors(file_of(tmp_path, text))["front_left"]
+    entry = load_motors(write_motor_file(tmp_path, text))["front_left"]
     assert entry.parameters.dc_gain == pytest.approx(25.0, rel=1e-12)
     assert entry.parameters.static_voltage == pytest.approx(0.4, rel=1e-12)
     assert not entry.knows_current and entry.delay == 0.002
 
 
-def test_names_with_dots_are_the_same_as_nesting(tmp_path):
+def test_dotted_names_equal_nested_keys(tmp_path):
     text = "motor_plant:\n  ros__parameters:\n    motors.rear_left.dc_gain: 20.0\n"
     text += "    motors.rear_left.time_constant: 0.1\n"
-    assert load_motors(file_of(tmp_path, text))["rear_left"].parameters.time_constant == 0.1
+    assert (
+        load_motors(write_motor_file(tmp_path, text))["rear_left"].parameters.time_constant == 0.1
+    )
 
 
 @pytest.mark.parametrize(
@@ -77,16 +79,16 @@ def test_names_with_dots_are_the_same_as_nesting(tmp_path):
         (("{", "["), "is not YAML"),
     ],
 )
-def test_bad_file_is_refused_in_one_line_that_names_file_and_value(tmp_path, change, words):
-    path = file_of(tmp_path, GOOD.replace(*change))
+def test_invalid_motor_file_is_refused_in_one_line_with_file_and_value(tmp_path, change, words):
+    path = write_motor_file(tmp_path, GOOD.replace(*change))
     with pytest.raises(ParameterError) as caught:
         load_motors(path)
     message = str(caught.value)
     assert words in message and "motors.yaml" in message and "\n" not in message
 
 
-def test_missing_motor_and_missing_file_are_named(tmp_path):
+def test_missing_motor_and_missing_file_are_reported(tmp_path):
     with pytest.raises(ParameterError, match=r"rear_right is missing; has front_left"):
-        load_motors(file_of(tmp_path, GOOD), ["front_left", "rear_right"])
+        load_motors(write_motor_file(tmp_path, GOOD), ["front_left", "rear_right"])
     with pytest.raises(ParameterError, match=r"nowhere\.yaml: cannot be read"):
         load_motors(tmp_path / "nowhere.yaml")

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The speed observer against the exact motor and counts as an encoder gives them."""
+"""The speed observer, fed with encoder counts, compared with the exact motor."""
 
 import math
 
@@ -14,7 +14,7 @@ from smp_motor_control.motor import Motor, MotorParameters
 from smp_motor_control.motor.parameters import MotorModel
 from smp_motor_control.observer import ObserverNoise, SpeedObserver, prediction, steady_gain
 
-# Motors 1 (oscillating poles) and 2 (real poles) of the paper, and one without L.
+# Motors 1 (complex poles) and 2 (real poles) of the paper, and one without inductance.
 MOTORS = {
     "motor 1": paper_motor("front_left", 0.445),
     "motor 2": paper_motor("front_right", 0.388),
@@ -35,12 +35,12 @@ def volts(t: float) -> float:
     return 6.0 + 2.0 * math.sin(8.3 * t) + 1.0 * math.sin(2.0 * math.pi * 0.31 * t)
 
 
-def observed(p: MotorParameters, **changes: float) -> tuple[Motor, SpeedObserver]:
+def make_motor_and_observer(p: MotorParameters, **changes: float) -> tuple[Motor, SpeedObserver]:
     return Motor(p), SpeedObserver(model_of(p), 0.005, ENCODER, **changes)
 
 
-def errors_of(p, observer, dt, duration=2.0, load=0.0, jitter=0.0):
-    """Errors of the observer and of differenced counts after the first 0.5 s [rad/s]."""
+def simulate_errors(p, observer, dt, duration=2.0, load=0.0, jitter=0.0):
+    """Return errors of the observer and of differenced counts after the first 0.5 s [rad/s]."""
     rng = np.random.default_rng(3)
     motor, differenced = Motor(p), DifferencedSpeed(ENCODER)
     time, seen, counted = 0.0, [], []
@@ -64,39 +64,39 @@ def rms(x: np.ndarray) -> float:
 
 @pytest.mark.parametrize("name", MOTORS)
 @pytest.mark.parametrize("rate", [200.0, 1000.0])
-def test_error_is_at_most_half_of_differenced_counts(name, rate):
+def test_observer_halves_error_of_differenced_counts(name, rate):
     p = MOTORS[name]
-    # Every number of the model wrong by 1 %, as after a mediocre identification.
+    # Every model parameter is off by 1 %, as after a mediocre identification.
     wrong = {n: 1.01 * getattr(p, n) for n in ("dc_gain", "time_constant")}
     observer = SpeedObserver(model_of(p, **wrong), 1.0 / rate, ENCODER)
-    seen, counted = errors_of(p, observer, 1.0 / rate)
-    assert rms(seen) <= 0.5 * rms(counted)  # the issue's claim
+    seen, counted = simulate_errors(p, observer, 1.0 / rate)
+    assert rms(seen) <= 0.5 * rms(counted)  # the claimed improvement
 
 
 @pytest.mark.parametrize("name", MOTORS)
-def test_unknown_load_leaves_no_bias_and_is_told(name):
+def test_unknown_load_is_estimated_without_speed_bias(name):
     p = MOTORS[name]
     observer = SpeedObserver(model_of(p), 0.005, ENCODER)
-    seen, _ = errors_of(p, observer, 0.005, duration=4.0, load=1.5)
-    # 700 samples of an error that is correlated over some 20 ms: mean known to 1/sqrt(175) of
-    # its rms of 0.4; a load that is not observed would leave 25 rad/s.
+    seen, _ = simulate_errors(p, observer, 0.005, duration=4.0, load=1.5)
+    # 700 samples of an error correlated over some 20 ms: the mean is known to 1/sqrt(175) of the
+    # rms of 0.4. Without a load estimate the bias would be 25 rad/s.
     assert np.mean(seen) == pytest.approx(0.0, abs=0.1)
     assert observer.load == pytest.approx(1.5, abs=0.3)  # its own steady deviation is 0.1 V
     assert observer.trusted
 
 
-def test_jitter_of_a_fifth_of_the_interval_does_not_matter():
+def test_observer_tolerates_20_percent_sampling_jitter():
     p = MOTORS["motor 1"]
     observer = SpeedObserver(model_of(p), 0.005, ENCODER)
-    seen, _ = errors_of(p, observer, 0.005, jitter=0.2)
-    steady, _ = errors_of(p, SpeedObserver(model_of(p), 0.005, ENCODER), 0.005)
+    seen, _ = simulate_errors(p, observer, 0.005, jitter=0.2)
+    steady, _ = simulate_errors(p, SpeedObserver(model_of(p), 0.005, ENCODER), 0.005)
     # The voltage is known exactly over every interval; gains are those of the nearest one.
     assert rms(seen) <= 1.2 * rms(steady)
 
 
 @pytest.mark.parametrize("late", [0.02, 0.05, 0.2])  # of a sample, either way
-def test_stamps_that_scatter_by_many_counts_are_no_contradiction(late):
-    """The counts are read on the beat, and stamped when they arrive."""
+def test_observer_stays_trusted_under_stamp_jitter_of_many_counts(late):
+    """Counts are sampled periodically and stamped on arrival."""
     p, dt = MOTORS["motor 1"], 0.005
     fine, rng, motor = Encoder(2_000.0), np.random.default_rng(6), Motor(p)
     observer = SpeedObserver(model_of(p), dt, fine)
@@ -112,12 +112,12 @@ def test_stamps_that_scatter_by_many_counts_are_no_contradiction(late):
             errors.append(speed - motor.speed)
     usual = 6.0 * model_of(p).dc_gain
     assert late * dt * usual > 4.0 * fine.angle_per_count
-    # A difference of two counts would be off by that share of the speed, and by the root of two.
+    # Differenced counts would have this stamp jitter twice, independently.
     assert rms(np.array(errors)) < 0.5 * late * math.sqrt(2.0 / 3.0) * usual
 
 
 def test_lost_samples_are_bridged_by_the_model():
-    motor, observer = observed(MOTORS["motor 1"])
+    motor, observer = make_motor_and_observer(MOTORS["motor 1"])
     errors = []
     for k in range(600):
         lost = 3 if k % 20 == 0 else 1
@@ -128,7 +128,7 @@ def test_lost_samples_are_bridged_by_the_model():
     assert observer.trusted
 
 
-def test_wrapping_counter_makes_no_difference():
+def test_counter_wrap_does_not_change_estimate():
     p = MOTORS["motor 1"]
     narrow, wide = Encoder(500.0, bits=12), Encoder(500.0)
     motor = Motor(p)
@@ -142,7 +142,7 @@ def test_wrapping_counter_makes_no_difference():
         assert speeds[0] == pytest.approx(speeds[1], nan_ok=True)
 
 
-def test_known_delay_is_taken_into_account():
+def test_known_delay_is_compensated():
     p, dt, delay = MOTORS["motor 2"], 0.005, 0.0075
     motor = Motor(p)
     aware = SpeedObserver(model_of(p, delay=delay), dt, ENCODER)
@@ -162,7 +162,7 @@ def test_known_delay_is_taken_into_account():
 
 
 @pytest.mark.parametrize("factor", [3.0, 0.3])
-def test_wrong_model_is_noticed_and_counts_take_over(factor):
+def test_observer_falls_back_to_differenced_counts_with_wrong_model(factor):
     p = MOTORS["motor 1"]
     wrong = model_of(p, dc_gain=factor * p.dc_gain, time_constant=p.time_constant / factor)
     observer = SpeedObserver(wrong, 0.005, ENCODER, window=1)
@@ -179,11 +179,11 @@ def test_wrong_model_is_noticed_and_counts_take_over(factor):
     assert fell_back > 40
 
 
-def test_trust_comes_back_when_model_and_counts_agree_again():
-    motor, observer = observed(MOTORS["motor 1"])
+def test_observer_trust_returns_when_model_and_counts_agree():
+    motor, observer = make_motor_and_observer(MOTORS["motor 1"])
     trusted = []
     for k in range(1200):
-        # For a second the motor gets another voltage than is reported.
+        # For a second the motor gets another voltage than the reported one.
         reported = 6.0
         motor.step(reported if not 400 <= k < 600 else (-6.0 if k % 40 < 20 else 6.0), 0.005)
         observer.step(ENCODER.count(motor.angle), reported, 0.005)
@@ -194,8 +194,8 @@ def test_trust_comes_back_when_model_and_counts_agree_again():
     assert observer.speed == pytest.approx(motor.speed, abs=1.5)  # four deviations of 0.35
 
 
-def test_impossible_load_is_not_trusted():
-    motor, observer = observed(MOTORS["motor 1"], max_load=18.0)
+def test_observer_is_not_trusted_when_load_exceeds_its_limit():
+    motor, observer = make_motor_and_observer(MOTORS["motor 1"], max_load=18.0)
     trusted = True
     for k in range(1000):
         # The encoder counts backwards: the model needs twice the voltage as a load.
@@ -206,8 +206,8 @@ def test_impossible_load_is_not_trusted():
     assert observer.speed < 0.0
 
 
-def test_standstill_is_zero_whatever_voltage_sticks():
-    motor, observer = observed(MOTORS["motor 1"])
+def test_estimate_is_zero_at_standstill_under_voltage_below_friction():
+    motor, observer = make_motor_and_observer(MOTORS["motor 1"])
     for _ in range(400):
         motor.step(0.3, 0.005)  # below the 0.45 V of dry friction
         observer.step(ENCODER.count(motor.angle), 0.3, 0.005)
@@ -217,7 +217,7 @@ def test_standstill_is_zero_whatever_voltage_sticks():
 
 
 @pytest.mark.parametrize("bad", [(math.nan, 0.005), (1.0, 0.0), (1.0, -0.1), (1.0, math.nan)])
-def test_sample_that_makes_no_sense_is_refused_and_changes_nothing(bad):
+def test_invalid_sample_is_refused_and_leaves_state_unchanged(bad):
     p = MOTORS["motor 1"]
     disturbed, calm = (SpeedObserver(model_of(p), 0.005, ENCODER) for _ in range(2))
     for observer in (disturbed, calm):
@@ -228,8 +228,8 @@ def test_sample_that_makes_no_sense_is_refused_and_changes_nothing(bad):
     assert disturbed.step(61, 6.0, 0.005) == calm.step(61, 6.0, 0.005)
 
 
-def test_long_gap_begins_again_from_the_counts():
-    motor, observer = observed(MOTORS["motor 1"])
+def test_observer_restarts_from_counts_after_long_gap():
+    motor, observer = make_motor_and_observer(MOTORS["motor 1"])
     for step in [0.005] * 200 + [3.0] + [0.005] * 200:
         motor.step(6.0, step)
         observer.step(ENCODER.count(motor.angle), 6.0, step)
@@ -237,9 +237,9 @@ def test_long_gap_begins_again_from_the_counts():
 
 
 @pytest.mark.parametrize("electrical", [2e-4, 1e-3, 1e-2])
-def test_gain_is_that_of_the_recursion_run_in_fine_steps(electrical):
-    # The covariance carried step by step through fiftieths of L/R, in which the exponential of
-    # Van Loan's block matrix is harmless, and corrected every 20 ms, until it repeats.
+def test_steady_gain_matches_kalman_recursion_in_fine_steps(electrical):
+    # The covariance is propagated in steps of L/R / 50, for which Van Loan's matrix exponential is
+    # well conditioned, and corrected every 20 ms until it is stationary.
     dt, tau, gain, quantum, noise = 0.02, 0.1, 20.0, 2.0 * math.pi / 500.0, ObserverNoise()
     tp = tau * electrical
     drift = np.zeros((4, 4))
@@ -264,7 +264,7 @@ def test_gain_is_that_of_the_recursion_run_in_fine_steps(electrical):
     assert steady_gain(model, quantum, noise, dt)[:4] == pytest.approx(K, rel=1e-6)
 
 
-def test_gain_stabilises_the_observer_of_any_motor_at_any_rate():
+def test_steady_gain_stabilises_observer_of_random_motors_and_rates():
     rng = np.random.default_rng(5)
     for _ in range(100):
         electrical, tau = 10.0 ** rng.uniform(-9, -2), 10.0 ** rng.uniform(-3, 1)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Odometry step by step against the arc and the covariance written down once more."""
+"""Odometry compared step by step with independent arc and covariance equations."""
 
 import math
 import random
@@ -19,7 +19,7 @@ def make(**more: float) -> Odometry:
 
 
 def arc(pose: np.ndarray, left: float, right: float) -> np.ndarray:
-    """The pose after an arc, its chord by the sine of half of the turn."""
+    """Return the pose after an arc, whose chord follows from the sine of half the turn."""
     turn, travel = (right - left) / B, (left + right) / 2.0
     chord = travel * (math.sin(turn / 2.0) / (turn / 2.0) if turn else 1.0)
     x, y, heading = pose
@@ -28,7 +28,7 @@ def arc(pose: np.ndarray, left: float, right: float) -> np.ndarray:
 
 
 def spread(p: np.ndarray, heading: float, left: float, right: float) -> np.ndarray:
-    """``F P F' + G Q G'`` by matrices: Q of both sides' travel, and of the skid in a turn."""
+    """Return ``F P F' + G Q G'``, where Q holds both sides' travel noise and the turn noise."""
     turn, travel = (right - left) / B, (left + right) / 2.0
     cos, sin = math.cos(heading + turn / 2.0), math.sin(heading + turn / 2.0)
     f = np.array([[1, 0, -travel * sin], [0, 1, travel * cos], [0, 0, 1]])
@@ -44,7 +44,7 @@ def state(odometry: Odometry) -> np.ndarray:
 
 
 @pytest.mark.parametrize("way", ["velocity", "position", "travel", "open loop"])
-def test_pose_and_covariance_follow_arcs_forth_and_back(way):
+def test_pose_and_covariance_match_arcs_in_both_directions(way):
     draw, odometry = random.Random(way), make()
     pose, p = np.zeros(3), np.zeros((3, 3))
     angles = [4.0, -7.0]
@@ -71,7 +71,7 @@ def test_pose_and_covariance_follow_arcs_forth_and_back(way):
 
 
 @pytest.mark.parametrize("turn", [0.0, 1e-9, 0.9e-6, 1.1e-6, 1e-5, -1e-5, 3.0])
-def test_a_turn_however_small_keeps_the_arc(turn):
+def test_arc_is_accurate_for_small_turns(turn):
     odometry = make()
     left, right = 1.0 - turn * B / 2, 1.0 + turn * B / 2
     odometry.set_odometry(1.0, 2.0, 0.7)
@@ -81,7 +81,7 @@ def test_a_turn_however_small_keeps_the_arc(turn):
     assert state(odometry) == pytest.approx(wanted, abs=1e-9)
 
 
-def test_velocity_is_the_mean_over_its_window_and_its_variance_that_of_the_travel():
+def test_velocity_is_the_window_mean_with_variance_of_travel():
     odometry, speeds = make(window=4), []
     draw = random.Random(2)
     for _ in range(10):
@@ -99,7 +99,7 @@ def test_velocity_is_the_mean_over_its_window_and_its_variance_that_of_the_trave
         assert angular == pytest.approx(of_sides / B**2 + TURN * abs(odometry.angular) / span)
 
 
-def test_speeds_and_commands_are_reported_as_they_are_given():
+def test_given_speeds_and_commands_are_reported_unchanged():
     odometry = make()
     odometry.update_from_travel(1.0, 1.0, 3.0, -2.0)
     assert odometry.linear == pytest.approx((3.0 * LEFT - 2.0 * RIGHT) / 2.0)
@@ -108,7 +108,7 @@ def test_speeds_and_commands_are_reported_as_they_are_given():
     assert (odometry.linear, odometry.angular) == (0.25, -0.5)
 
 
-def test_a_pose_that_is_set_is_without_doubt_and_a_reset_forgets_all():
+def test_set_pose_has_zero_covariance_and_reset_clears_all():
     odometry = make()
     odometry.update_from_position(0.0, 0.0, 0.1)
     odometry.update_from_position(1.0, 2.0, 0.1)
@@ -128,7 +128,7 @@ BAD = [math.nan, math.inf, -math.inf]
 
 
 @pytest.mark.parametrize("bad", BAD)
-def test_non_finite_values_change_nothing(bad):
+def test_non_finite_values_are_refused_and_leave_state_unchanged(bad):
     odometry = make()
     odometry.update_from_position(0.0, 0.0, 0.1)
     odometry.update_from_velocity(1.0, 2.0, 0.1)
@@ -149,7 +149,7 @@ def test_non_finite_values_change_nothing(bad):
 
 
 @pytest.mark.parametrize("side", [0, 1])
-def test_positions_of_a_wheel_that_would_be_too_fast_are_no_motion(side):
+def test_position_steps_above_maximum_wheel_speed_are_rejected(side):
     odometry = make(max_wheel_speed=8.0)
     at = lambda angle: tuple(angle if k == side else 0.0 for k in range(2))  # noqa: E731
     odometry.update_from_position(*at(0.0), 0.125)
@@ -161,9 +161,9 @@ def test_positions_of_a_wheel_that_would_be_too_fast_are_no_motion(side):
     assert odometry.heading == pytest.approx((1.0 + 0.5) * radius / B * (1 if side else -1))
 
 
-def test_ten_steps_and_their_noise_are_the_default():
+def test_default_window_is_ten_steps_with_default_noise():
     plain = Odometry(B, LEFT, RIGHT)
-    for k in range(12):  # ten steps are the mean, 1e-4 and 1e-2 the noise, by default
+    for k in range(12):  # defaults: a window of 10 steps, noise 1e-4 and 1e-2
         plain.update_from_velocity(10.0 * k, 8.0 * k, 0.1)
     assert plain.linear == pytest.approx(np.mean(range(2, 12)))
     plain.update_from_travel(0.0, 0.0, 10.0, 0.0)
@@ -171,13 +171,13 @@ def test_ten_steps_and_their_noise_are_the_default():
     assert plain.twist_variances(1.0) == pytest.approx((of_sides / 4, of_sides / B**2 + 1e-2 * 2.0))
 
 
-def test_a_new_geometry_counts_from_the_next_step_on():
+def test_new_geometry_applies_from_the_next_step():
     odometry = make()
     odometry.update_from_travel(1.0, 0.8, 0.0, 0.0)
     odometry.configure(1.0, 0.2, 0.3, 0.0, 0.0)
     before = odometry.covariance
     odometry.update_from_travel(1.0, 2.0 / 3.0, 0.0, 0.0)
     assert odometry.x == pytest.approx(0.1 + 0.2)
-    # With zero noise the covariance is only transported.
+    # With zero noise the covariance is only propagated.
     carried = np.array([[1, 0, 0], [0, 1, 0.2], [0, 0, 1]])
     assert odometry.covariance == pytest.approx(carried @ before @ carried.T, abs=1e-15)

@@ -25,22 +25,22 @@ def test_integral_does_not_wind_up_while_output_saturates(strategy):
     out = settle(pid, 20.0, 0.0, 1000)
     assert out.saturated
     assert out.output == 12.0
-    # Without anti-windup it would stand at i e t = 2000 V; the clamp leaves room for 12 V at most.
+    # Without anti-windup it would be i e t = 2000 V; the clamp allows at most 12 V.
     assert abs(out.i_term) <= 12.0
 
 
 @pytest.mark.parametrize("p", [0.0, 2.0])
-def test_back_calculation_with_time_constant_zero_never_makes_nan(p):
+def test_back_calculation_with_zero_time_constant_stays_finite(p):
     pid = Pid(PidGains(p=p, i=3.0, antiwindup_strategy="back_calculation", **VOLTS))
     out = settle(pid, 50.0, 0.0, 500)
     assert math.isfinite(out.i_term)
     assert out.output == 12.0
-    # Back within the clamp a few steps after the error has changed its sign: not wound up.
+    # The output leaves the clamp a few steps after the error changes sign: no windup.
     assert settle(pid, -50.0, 0.0, 20).output < 12.0
 
 
 @pytest.mark.parametrize("dt", [-1e-3, -math.inf, math.nan, math.inf])
-def test_time_that_does_not_pass_forward_is_refused_and_changes_nothing(dt):
+def test_invalid_time_step_is_refused_and_leaves_integral_unchanged(dt):
     pid = Pid(PidGains(p=1.0, i=2.0))
     settle(pid, 1.0, 0.0, 5)
     before = pid.i_term
@@ -55,7 +55,7 @@ def test_time_step_of_zero_repeats_the_last_command():
     assert pid.step(5.0, 0.0, 0.0) == first
 
 
-def test_output_is_a_value_of_its_own():
+def test_output_is_immutable():
     pid = Pid(PidGains(p=1.0))
     first = pid.step(1.0, 0.0, 0.1)
     pid.step(2.0, 0.0, 0.1)

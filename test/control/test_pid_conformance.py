@@ -16,19 +16,19 @@ NAMES = {f"{x}_{end}": f"{x}_clamp_{end}" for x in "ui" for end in ("min", "max"
 
 
 def cases(kind, key=""):
-    """Parametrize a test by the cases of a kind that have a key."""
+    """Parametrize a test with the cases of a kind, optionally only those with a key."""
     some = [case for case in CASES[kind] if not key or key in case]
     return pytest.mark.parametrize("case", some, ids=lambda case: case["id"])
 
 
 def close(value: float, expected: object, tolerance: float) -> bool:
-    """Compare as the file means it: within a tolerance, and NaN equal to the string 'NaN'."""
+    """Return whether a value is within the tolerance, or both are NaN (the string 'NaN')."""
     expected = float(expected)
     return math.isnan(value) if math.isnan(expected) else abs(value - expected) <= tolerance
 
 
 def gains_of(given: dict, **more: object) -> PidGains:
-    # Their derivative acts on the error: both set-point weights are 1.
+    # control_toolbox's derivative acts on the error: both set-point weights are 1.
     named = {
         NAMES.get(key, key): value
         for key, value in given.items()
@@ -38,7 +38,7 @@ def gains_of(given: dict, **more: object) -> PidGains:
 
 
 @cases("cases")
-def test_sequence_gives_the_numbers_of_control_toolbox(case):
+def test_pid_sequences_match_control_toolbox(case):
     pid = Pid(gains_of(case["gains"]))
     if "expect_tracking_time_constant" in case:
         assert pid.tracking_time_constant == case["expect_tracking_time_constant"]
@@ -47,7 +47,7 @@ def test_sequence_gives_the_numbers_of_control_toolbox(case):
             pid.reset(save_i_term=step["save_i_term"])
             continue
         if step["op"] == "set_current_cmd":
-            continue  # their setter does not affect the next command; this class has no setter
+            continue  # the setter does not affect the next command; this class has none
         assert step["op"] == "compute"
         arguments = (float(step["error"]), 0.0, step["dt"])
         rate = step.get("error_dot")
@@ -62,12 +62,12 @@ def test_sequence_gives_the_numbers_of_control_toolbox(case):
 
 
 @cases("pid_controller_cases")
-def test_whole_controller_gives_the_numbers_of_pid_controller(case):
+def test_pid_with_feed_forward_matches_pid_controller(case):
     forward = case.get("feedforward_gain", 0.0) if case.get("feedforward_enabled") else 0.0
     reference, state, dt = case["reference"], case["state"], case["dt"]
-    if case.get("angle_wraparound"):  # the caller's business: the shortest way to the reference
+    if case.get("angle_wraparound"):  # done by the caller: the shortest angle to the reference
         reference = state + math.remainder(reference - state, 2.0 * math.pi)
-    dual = "reference_dot" in case  # there feed-forward multiplies the rate of the reference
+    dual = "reference_dot" in case  # then feed-forward multiplies the reference's rate
     gains = gains_of(
         case["gains"],
         antiwindup_strategy=case["antiwindup_strategy"],
@@ -81,7 +81,7 @@ def test_whole_controller_gives_the_numbers_of_pid_controller(case):
         rates["error_rate"] = case["reference_dot"] - case["state_dot"]
     out = pid.step(reference, state, dt, **rates)
     if case["id"] == "pidc_ff_can_exceed_clamp":
-        # Known to be wrong there (15 V of an output limited to 5 V): inside the clamp here.
+        # A known fault of pid_controller (15 V despite a limit of 5 V): clamped here.
         assert out.output == 5.0
         assert out.unsaturated == pytest.approx(case["reference"] + 10.0)
         assert out.saturated
@@ -98,13 +98,13 @@ def test_whole_controller_gives_the_numbers_of_pid_controller(case):
     [case for case in CASES["parameter_cases"] if isinstance(case.get("input"), dict)],
     ids=lambda case: case["id"],
 )
-def test_bad_bounds_are_refused_on_construction(case):
+def test_invalid_clamps_are_refused_on_construction(case):
     with pytest.raises(ParameterError, match="clamp"):
         gains_of(case["input"])
 
 
 @cases("parameter_cases", "set")
-def test_bad_bounds_leave_the_gains_as_they_were(case):
+def test_refused_clamps_leave_gains_unchanged(case):
     gains = gains_of(case["initial"])
     pid = Pid(gains)
     with pytest.raises(ParameterError, match="clamp"):
@@ -113,7 +113,7 @@ def test_bad_bounds_leave_the_gains_as_they_were(case):
 
 
 @pytest.mark.parametrize("strategy", ["", "undefined", "Back_Calculation", "legacy", None, 3])
-def test_other_strategies_are_refused_by_name(strategy):
+def test_unknown_antiwindup_strategies_are_refused(strategy):
     with pytest.raises(ParameterError, match="antiwindup_strategy"):
         PidGains(antiwindup_strategy=strategy)
 
@@ -132,6 +132,6 @@ def test_other_strategies_are_refused_by_name(strategy):
     ],
     ids=str,
 )
-def test_rules_of_validation_hold(wrong):
+def test_invalid_clamps_and_tracking_times_are_refused(wrong):
     with pytest.raises(ParameterError, match=next(reversed(wrong))):
         PidGains(**wrong)

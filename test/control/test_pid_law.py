@@ -73,7 +73,7 @@ class Law:
                 "feedforward": f}  # fmt: skip
 
     def at_rest(self) -> float:
-        """The command at the last inputs without the integral."""
+        """Return the command at the last inputs without the integral."""
         g, (r, y, a) = self.g, self.seen
         return g.p * (g.setpoint_weight_p * r - y) + g.d * self.rate + self.feedforward(r, a)
 
@@ -100,7 +100,7 @@ PUBLISHED = dict(
 
 @pytest.mark.parametrize("fixed", [{}, PUBLISHED], ids=["law", "published rule"])
 @pytest.mark.parametrize("seed", range(10))
-def test_every_term_of_random_controllers_follows_the_law(seed, fixed):
+def test_every_term_of_random_controllers_matches_the_control_law(seed, fixed):
     draw = random.Random(seed)
     for _ in range(20):
         gains = replace(drawn_gains(draw), **fixed)
@@ -118,7 +118,7 @@ def test_every_term_of_random_controllers_follows_the_law(seed, fixed):
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_change_of_gains_keeps_the_output_by_the_integral(seed):
+def test_gain_change_is_bumpless_through_the_integral(seed):
     draw = random.Random(seed)
     for _ in range(40):
         old, new = drawn_gains(draw), drawn_gains(draw)
@@ -139,14 +139,14 @@ def test_change_of_gains_keeps_the_output_by_the_integral(seed):
         law.integral = clamp(moved, new.i_clamp_min, new.i_clamp_max)
         assert pid.i_term == pytest.approx(law.integral, rel=ROUNDING, abs=ROUNDING)
         assert pid.gains is new
-        # The previous value of the next difference has the new weight, too.
+        # The previous value of the next difference is weighted anew.
         law.before = new.setpoint_weight_d * law.seen[0] - law.seen[1]
         wanted = law.step(1.0, 0.5, 0.02, 0.0, None)
         out = pid.step(1.0, 0.5, 0.02)
         assert out.output == pytest.approx(wanted["output"], rel=ROUNDING, abs=ROUNDING)
 
 
-def test_a_refused_step_is_all_nan_but_the_integral_and_leaves_no_trace():
+def test_non_finite_input_gives_nan_output_and_leaves_state_unchanged():
     gains = PidGains(p=1.0, i=2.0, d=0.1, feedforward_acceleration=0.1)
     for bad in [(math.nan, 0.0, 0.01), (0.0, math.inf, 0.01), (0.0, 0.0, 0.01, -math.inf),
                 (0.0, 0.0, 0.01, 0.0, math.nan), (0.0, 0.0, 0.01, 0.0, math.inf)]:  # fmt: skip
@@ -163,7 +163,7 @@ def test_a_refused_step_is_all_nan_but_the_integral_and_leaves_no_trace():
         assert pid.step(1.0, 0.3, 0.01) == calm.step(1.0, 0.3, 0.01)
 
 
-def test_numbers_that_overflow_leave_integral_and_rate_finite():
+def test_overflow_leaves_integral_and_derivative_finite():
     pid = Pid(PidGains(p=0.0, i=1e9, d=0.0, u_clamp_min=-12.0, u_clamp_max=12.0))
     for sign in (1.0, -1.0):
         for _ in range(3):
@@ -177,7 +177,7 @@ def test_numbers_that_overflow_leave_integral_and_rate_finite():
         assert pid.step(0.0, sign * 1e308, 0.1).d_term == 0.0, "an overflowed rate is forgotten"
 
 
-def test_a_controller_that_has_done_nothing_commands_nothing():
+def test_output_is_zero_before_first_step_and_after_reset():
     out = Pid(PidGains(p=3.0, i=1.0)).step(9.0, 1.0, 0.0)
     assert out == (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, False)
     pid = Pid(PidGains(p=3.0, i=1.0))
@@ -188,15 +188,15 @@ def test_a_controller_that_has_done_nothing_commands_nothing():
     assert pid.i_term == 0.0 and pid.step(9.0, 1.0, 0.0).i_term == 0.0
 
 
-def test_gains_that_change_before_the_first_step_leave_the_integral_empty():
+def test_gain_change_before_first_step_leaves_integral_at_zero():
     pid = Pid(PidGains(p=1.0, i=1.0))
     pid.set_gains(PidGains(p=5.0, i=1.0, setpoint_weight_d=1.0))
     assert pid.i_term == 0.0
-    # The first sample rests at the measurement: the set-point's weight alone is seen to change.
+    # The first difference assumes rest at the measurement: only the set-point term changes.
     assert pid.step(2.0, 1.0, 0.1).p_term == 5.0
 
 
-def test_an_integral_gain_below_the_minimum_counts_as_zero():
+def test_integral_gain_below_epsilon_counts_as_zero():
     for gain, grows in ((EPSILON, False), (-EPSILON, False), (3 * EPSILON, True)):
         gains = PidGains(p=0.0, i=gain, u_clamp_max=1.0, antiwindup_strategy="back_calculation",
                          tracking_time_constant=1.0, feedforward_velocity=1.0)  # fmt: skip
@@ -209,7 +209,7 @@ def test_an_integral_gain_below_the_minimum_counts_as_zero():
     assert pid.i_term == 0.0
 
 
-def test_the_default_of_the_tracking_time_constant_is_that_of_the_literature():
+def test_default_tracking_time_constant_follows_astrom_and_hagglund():
     # Astrom and Hagglund: the square root of Ti Td, or Ti without derivative.
     cases = [({"p": 3.0, "i": 12.0}, 0.25), ({"p": 3.0, "i": 2.0, "d": 0.5}, 0.5),
              ({"p": 3.0, "i": 2.0, "d": 0.5, "tracking_time_constant": 7.0}, 7.0),
@@ -219,13 +219,13 @@ def test_the_default_of_the_tracking_time_constant_is_that_of_the_literature():
 
 
 @pytest.mark.parametrize("name", ["u_clamp_min", "u_clamp_max", "i_clamp_min", "i_clamp_max"])
-def test_a_clamp_may_be_infinite_and_no_other_number(name):
+def test_clamps_may_be_infinite(name):
     value = -math.inf if name.endswith("min") else math.inf
     assert getattr(PidGains(**{name: value}), name) == value
     PidGains(i_clamp_min=0.0, i_clamp_max=0.0)
 
 
-def test_the_unsupported_strategy_is_refused_with_its_replacement():
+def test_unsupported_strategy_is_refused_with_its_replacement():
     with pytest.raises(ValueError, match="'legacy' is not offered: use 'none'"):
         PidGains(antiwindup_strategy="legacy")
     with pytest.raises(ValueError, match="must be one of none"):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The driven motor: commands when they arrive, voltage as it was, sensors as they are."""
+"""The simulated motor with its driver: command timing, applied voltage and sensors."""
 
 import dataclasses
 import math
@@ -17,20 +17,20 @@ ENTRY = load_motors(Path(__file__).parents[2] / "config" / "motors_paper.yaml")[
 IDEAL = DriveSettings(command_timeout=math.inf)
 
 
-def test_nothing_moves_before_the_first_command():
+def test_motor_rests_before_the_first_command():
     plant = DrivenMotor(ENTRY, DriveSettings(current_noise=0.0))
     sample = plant.sample(5.0)
     assert sample[:2] == (0.0, 0.0) and sample.encoder_count == 0 and plant.timed_out
 
 
-def test_commands_act_from_the_instant_of_their_arrival():
+def test_commands_act_from_their_time_of_arrival():
     plant, motor = DrivenMotor(ENTRY, IDEAL), Motor(ENTRY.parameters)
     plant.command(0.0123, 6.0)
     plant.command(0.0177, -3.0)
     sample = plant.sample(0.02)
     for voltage, dt in ((0.0, 0.0123), (6.0, 0.0054), (-3.0, 0.0023)):
         motor.step(voltage, dt)
-    # The same steps but for the rounding of the instants.
+    # The same steps up to the rounding of times.
     assert plant.motor.speed == pytest.approx(motor.speed, rel=1e-9)
     assert sample.voltage == pytest.approx((6.0 * 0.0054 - 3.0 * 0.0023) / 0.02, rel=1e-9)
 
@@ -66,7 +66,7 @@ def test_non_finite_command_gives_zero_volts(voltage):
     assert plant.sample(0.2).voltage == 0.0
 
 
-def test_supply_limits_and_pwm_rounds():
+def test_voltage_is_limited_by_supply_and_rounded_to_pwm_steps():
     plant = DrivenMotor(ENTRY, dataclasses.replace(IDEAL, pwm_steps=8))
     plant.command(0.0, 100.0)
     assert plant.sample(0.01).voltage == pytest.approx(12.0)
@@ -88,7 +88,7 @@ def test_battery_sags_under_the_current_of_all_motors():
     assert samples[0].voltage < 11.5
 
 
-def test_delay_of_the_motor_postpones_a_command():
+def test_motor_delay_postpones_commands():
     plant = DrivenMotor(dataclasses.replace(ENTRY, delay=0.01), IDEAL)
     plant.command(0.0, 6.0)
     assert plant.sample(0.01).voltage == 0.0
@@ -104,7 +104,7 @@ def test_current_is_nan_without_a_sensor_and_noisy_with_one():
     assert np.std(currents) == pytest.approx(0.05, rel=0.07)
 
 
-def test_reported_speed_is_made_of_counts_and_true_without_a_window():
+def test_reported_speed_is_quantised_to_counts_around_true_speed():
     plant = DrivenMotor(ENTRY, IDEAL)
     plant.command(0.0, 8.0)
     for k in range(1, 300):
@@ -116,7 +116,7 @@ def test_reported_speed_is_made_of_counts_and_true_without_a_window():
     assert sample.position == pytest.approx(ENTRY.gearbox.to_wheel(plant.motor.angle), abs=1e-3)
 
 
-def test_narrow_counter_wraps_and_the_position_does_not():
+def test_narrow_counter_wraps_while_position_does_not():
     narrow = dataclasses.replace(ENTRY, encoder=dataclasses.replace(ENTRY.encoder, bits=8))
     plant = DrivenMotor(narrow, IDEAL)
     plant.command(0.0, 12.0)
@@ -127,7 +127,7 @@ def test_narrow_counter_wraps_and_the_position_does_not():
     )
 
 
-def test_load_at_the_wheel_slows_it_as_the_motor_equation_predicts():
+def test_speed_under_load_matches_motor_equation():
     plant = DrivenMotor(ENTRY, IDEAL)
     plant.command(0.0, 10.0)
     plant.load(0.0, 65.5 * 0.01)
@@ -141,7 +141,7 @@ def test_load_at_the_wheel_slows_it_as_the_motor_equation_predicts():
     assert not plant.load(20.0, math.nan)
 
 
-def test_a_latched_command_waits_for_the_next_sample():
+def test_latched_command_takes_effect_at_the_next_sample():
     plant = DrivenMotor(ENTRY, DriveSettings(latch=True))
     plant.sample(0.01)
     plant.command(0.012, 5.0)
@@ -159,7 +159,7 @@ def test_a_latched_command_waits_for_the_next_sample():
         ({"leads": -1, "encoder": -1}, -1, 1),
     ],
 )
-def test_swapped_leads_reverse_the_motor_and_a_swapped_encoder_the_counts(faults, turns, counts):
+def test_swapped_leads_reverse_motor_and_swapped_encoder_reverses_counts(faults, turns, counts):
     entry = dataclasses.replace(ENTRY, wiring=Wiring(**faults))
     plant = DrivenMotor(entry, IDEAL)
     plant.command(0.0, 6.0)
@@ -168,11 +168,11 @@ def test_swapped_leads_reverse_the_motor_and_a_swapped_encoder_the_counts(faults
     assert math.copysign(1, plant.motor.speed) == turns
     for value in (sample.encoder_count, sample.velocity, sample.position):
         assert math.copysign(1, value) == counts
-    # The driver knows of neither: it reports the voltage and the current that it gave.
+    # The driver is unaware of both and reports the voltage and current that it applied.
     assert sample.voltage == pytest.approx(6.0, rel=1e-12) and sample.current > 0
 
 
-def test_nothing_arrives_of_a_command_within_the_dead_zone():
+def test_command_within_dead_zone_gives_zero_volts():
     plant = DrivenMotor(dataclasses.replace(ENTRY, wiring=Wiring(dead_zone=2.0)), IDEAL)
     plant.command(0.0, -2.0)
     assert plant.sample(0.5).voltage == 0.0
@@ -181,7 +181,7 @@ def test_nothing_arrives_of_a_command_within_the_dead_zone():
     assert plant.motor.speed < 0
 
 
-def test_faults_stand_in_a_motor_file_and_are_checked():
+def test_wiring_faults_are_read_from_motor_file_and_validated():
     motor = {"dc_gain": 25.0, "time_constant": 0.05, "leads": -1, "described_gear_ratio": 30.0}
     wiring = parse_motors({"left": motor}, "file")["left"].wiring
     assert wiring == Wiring(leads=-1, described_gear_ratio=30.0)

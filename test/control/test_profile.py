@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""References within limits, smooth, and on time."""
+"""Reference profiles: limits, smoothness and duration."""
 
 import math
 from dataclasses import replace
@@ -25,10 +25,10 @@ from smp_motor_control.reference.time_optimal import VoltageLimited
 REST = Reference(0.0, 0.0, 0.0)
 
 
-def test_minimum_jerk_has_its_stated_peaks():
+def test_minimum_jerk_has_stated_peak_acceleration_and_jerk():
     transition = MinimumJerk(Reference(1.0, 0.0, 0.0), 4.0, 0.2)
     seen = [transition.at(t) for t in np.linspace(0.0, 0.2, 20001)]
-    # The grid misses a parabola's top by (1/40000)^2 at most.
+    # The grid misses the peak of a parabola by at most (1/40000)^2.
     assert max(x.acceleration for x in seen) == pytest.approx(PEAK_ACCELERATION * 3.0 / 0.2, 1e-6)
     assert max(x.jerk for x in seen) == pytest.approx(PEAK_JERK * 3.0 / 0.2**2, rel=1e-6)
 
@@ -57,7 +57,7 @@ def test_wheels_with_different_steps_arrive_at_the_same_instant():
     assert [profile.now.velocity for profile in profiles] == [0.1, -2.0, 5.0]
 
 
-def test_limit_stretches_the_transition_just_enough():
+def test_transition_is_stretched_just_enough_for_acceleration_limit():
     limits = ProfileLimits(acceleration=10.0)
     profile = Profile(limits, transition_time=0.15)
     profile.set_target(4.0)
@@ -77,7 +77,7 @@ targets = st.lists(st.tuples(st.floats(-6.0, 6.0), st.integers(1, 80)), min_size
 @pytest.mark.parametrize("transition_time", [0.0, 0.15])
 @given(targets=targets)
 @example(targets=[(-3.0, 47), (-4.53125, 62), (-5.0, 42), (-1.65625, 52), (0.0, 8), (-5.0, 32)])
-def test_reference_keeps_its_limits_through_any_change_of_mind(transition_time, targets):
+def test_reference_keeps_limits_under_any_target_changes(transition_time, targets):
     limits = ProfileLimits(velocity=5.0, acceleration=30.0, jerk=600.0)
     profile = Profile(limits, transition_time)
     dt = 0.002
@@ -86,7 +86,7 @@ def test_reference_keeps_its_limits_through_any_change_of_mind(transition_time, 
         for _ in range(steps):
             before = profile.now
             now = profile.step(dt)
-            # The profile checks moving polynomials on a grid: up to 2 % between its points.
+            # The profile checks polynomials on a grid: up to 2 % more between its points.
             assert abs(now.velocity) <= 5.0
             assert abs(now.acceleration) <= 30.0 * 1.02
             assert abs(now.velocity - before.velocity) <= 30.0 * 1.02 * dt + 1e-12
@@ -95,7 +95,7 @@ def test_reference_keeps_its_limits_through_any_change_of_mind(transition_time, 
     assert profile.now == Reference(min(max(targets[-1][0], -5.0), 5.0), 0.0, 0.0)
 
 
-def test_fastest_transition_within_limits_is_as_fast_as_the_formula():
+def test_fastest_transition_within_limits_has_analytic_duration():
     profile = Profile(ProfileLimits(acceleration=10.0, jerk=100.0))
     profile.set_target(4.0)
     elapsed = 0.0
@@ -105,7 +105,7 @@ def test_fastest_transition_within_limits_is_as_fast_as_the_formula():
     assert elapsed == pytest.approx(4.0 / 10.0 + 10.0 / 100.0, abs=0.0011)  # D/a + a/j, one step
 
 
-def test_retargeting_half_way_keeps_velocity_acceleration_and_jerk():
+def test_retargeting_keeps_reference_and_its_derivatives_continuous():
     profile = Profile(transition_time=0.2)
     profile.set_target(4.0)
     for _ in range(80):
@@ -119,7 +119,7 @@ def test_retargeting_half_way_keeps_velocity_acceleration_and_jerk():
     assert profile.now == Reference(-1.0, 0.0, 0.0)
 
 
-def test_repeated_target_does_not_start_again():
+def test_repeated_target_does_not_restart_transition():
     profile = Profile(transition_time=0.1)
     for _ in range(101):
         profile.set_target(2.0)
@@ -127,13 +127,13 @@ def test_repeated_target_does_not_start_again():
     assert profile.now == Reference(2.0, 0.0, 0.0)
 
 
-def test_without_limits_the_reference_jumps():
+def test_reference_is_a_step_without_limits():
     profile = Profile()
     profile.set_target(3.0)
     assert profile.step(0.001) == Reference(3.0, 0.0, 0.0)
 
 
-def test_looking_ahead_moves_nothing():
+def test_look_ahead_leaves_profile_unchanged():
     profile = Profile(transition_time=0.1)
     profile.set_target(2.0)
     profile.step(0.02)
@@ -143,7 +143,7 @@ def test_looking_ahead_moves_nothing():
 
 
 @pytest.mark.parametrize("bad", [math.nan, math.inf])
-def test_target_that_is_not_finite_leaves_the_old_one(bad):
+def test_non_finite_target_is_refused_and_old_target_kept(bad):
     profile = Profile(transition_time=0.1)
     profile.set_target(2.0)
     with pytest.raises(ParameterError, match="target"):
@@ -151,7 +151,7 @@ def test_target_that_is_not_finite_leaves_the_old_one(bad):
     assert profile.target == 2.0
 
 
-def test_parameters_of_zero_mean_no_limit():
+def test_zero_parameters_mean_no_limits():
     zeros = dict.fromkeys(("max_velocity", "max_acceleration", "max_jerk"), 0.0)
     assert build_settings(ProfileLimits, zeros) == ProfileLimits()
 
@@ -173,7 +173,7 @@ drives = st.builds(
     st.floats(-1.0, 1.0),
     st.sampled_from([0.001, 0.005, 0.01]),
 )
-def test_fastest_change_ends_at_rest_within_its_voltage(drive, bend, begin, end, push, dt):
+def test_voltage_limited_transition_ends_at_rest_within_voltage(drive, bend, begin, end, push, dt):
     if bend > 0.001:
         drive = replace(drive, time_constant_product=bend * drive.time_constant**2)
     top, tau = drive.top_speed, drive.time_constant
@@ -181,7 +181,7 @@ def test_fastest_change_ends_at_rest_within_its_voltage(drive, bend, begin, end,
     change = VoltageLimited(start, end * top, drive, dt)
     if change.duration == 0.0:
         return
-    # Of whole samples, so that a voltage that is held over samples can be the one it needs.
+    # The duration is a whole number of samples, so that a held voltage can realise it.
     assert change.duration / dt == pytest.approx(round(change.duration / dt), abs=1e-6)
     last = change.at(change.duration * (1.0 - 1e-9))
     assert last.velocity == pytest.approx(end * top, abs=1e-5 * top)
@@ -189,23 +189,23 @@ def test_fastest_change_ends_at_rest_within_its_voltage(drive, bend, begin, end,
         assert last.acceleration * tau == pytest.approx(0.0, abs=1e-4 * top)
     seen = [change.at(change.duration * k / 50) for k in range(50)]
     if drive.time_constant_product:
-        # Rounding of the jerk, a difference of large numbers, is all that may go beyond.
+        # Only rounding of the jerk, a difference of large numbers, may exceed the limit.
         assert max(abs(drive.needed(x)) for x in seen) <= top * (1 + 1e-6)
 
 
-def test_a_first_order_motor_gets_the_time_of_the_textbook():
+def test_voltage_limited_duration_is_analytic_for_first_order_motor():
     drive = Drive(top_speed=10.0, time_constant=0.1)
     change = VoltageLimited(REST, 5.0, drive, 1e-4)
     # w = U (1 - exp(-t / tau)), rounded up to samples.
     assert 0.1 * math.log(2.0) <= change.duration <= 0.1 * math.log(2.0) + 1e-4
 
 
-def test_no_voltage_within_the_limit_is_faster():
+def test_voltage_limited_transition_is_time_optimal():
     drive = Drive(top_speed=10.0, time_constant=0.05, time_constant_product=0.0008)
     dt, target = 0.005, 6.0
     samples = round(VoltageLimited(REST, target, drive, dt).duration / dt)
-    # Every sequence of voltages of one sample less: its reachable states are a zonotope, which
-    # contains the target if and only if a linear programme has a solution.
+    # States reachable by bounded voltages in n samples form a zonotope. It contains the target if
+    # and only if a linear programme is feasible.
     A = np.array([[0.0, 1.0], [-1.0 / 0.0008, -0.05 / 0.0008]])
     step = expm(A * dt)
     push = (np.eye(2) - step) @ np.array([1.0, 0.0])
@@ -217,7 +217,7 @@ def test_no_voltage_within_the_limit_is_faster():
         assert found.success == possible
 
 
-def test_a_small_change_takes_the_transition_time_and_a_large_one_is_limited_by_voltage():
+def test_small_step_takes_transition_time_and_large_step_is_voltage_limited():
     drive = Drive(top_speed=10.0, time_constant=0.05, time_constant_product=0.0008)
     profile = Profile(transition_time=0.05, drive=drive)
     durations = []
@@ -229,7 +229,7 @@ def test_a_small_change_takes_the_transition_time_and_a_large_one_is_limited_by_
     assert durations[1] == pytest.approx(0.1)  # 20 samples
 
 
-def test_an_acceleration_limit_holds_in_addition_to_the_voltage():
+def test_acceleration_limit_holds_in_addition_to_voltage_limit():
     drive = Drive(top_speed=10.0, time_constant=0.05, time_constant_product=0.0008)
     profile = Profile(ProfileLimits(acceleration=40.0), transition_time=0.05, drive=drive)
     profile.set_target(8.0, 0.005)
@@ -238,7 +238,7 @@ def test_an_acceleration_limit_holds_in_addition_to_the_voltage():
     assert max(drive.needed(x) for x in seen) <= 1.001 * 10.0
 
 
-def test_a_limit_lowered_on_the_way_lets_the_acceleration_only_fall():
+def test_acceleration_only_falls_after_limit_is_lowered_in_transition():
     profile = Profile(ProfileLimits(acceleration=30.0, jerk=600.0), transition_time=0.15)
     profile.set_target(3.0)
     for _ in range(30):
@@ -248,6 +248,6 @@ def test_a_limit_lowered_on_the_way_lets_the_acceleration_only_fall():
     largest = abs(profile.now.acceleration)
     assert largest > 5.0
     while profile.duration:
-        # A fall that starts without jerk overshoots nothing; rounding alone.
+        # A decrease that starts without jerk does not overshoot; only rounding is allowed.
         assert abs(profile.step(0.002).acceleration) <= largest * (1 + 1e-6)
     assert profile.now == Reference(4.0, 0.0, 0.0)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Numbers that no robot has are refused by their name, wherever they are given."""
+"""Invalid parameter values are refused with their name."""
 
 import math
 from collections.abc import Iterator
@@ -25,7 +25,7 @@ NAN, INF = math.nan, math.inf
 MOTOR = dict(resistance=1.0, inductance=0.1, motor_constant=0.1, inertia=1e-5, viscous_friction=0.0)
 AXLE = dict(wheel_separation=0.5, left_radius=0.1, right_radius=0.125)
 TABLE = [
-    # what is made, its other numbers, names, and values that each of them refuses
+    # class, other arguments, parameter names, and values that each of them refuses
     (MotorParameters, MOTOR, "resistance", (0.0, True)),
     (MotorParameters, MOTOR, "inertia", (-1e-6, 0.0)),
     (MotorParameters, MOTOR, "motor_constant", (NAN,)),
@@ -68,7 +68,7 @@ def cases() -> Iterator[object]:
 
 
 @pytest.mark.parametrize(("make", "others", "name", "values"), list(cases()))
-def test_an_impossible_number_is_refused_by_its_name(make, others, name, values):
+def test_invalid_value_is_refused_with_its_name(make, others, name, values):
     for value in values:
         with pytest.raises(ParameterError, match=name):
             make(**{**others, name: value})
@@ -87,7 +87,7 @@ def test_an_impossible_number_is_refused_by_its_name(make, others, name, values)
         *((FaultLimits, {}, name, (0.0,)) for name in FaultLimits.__dataclass_fields__),
     ],
 )
-def test_a_number_at_its_limit_is_taken(make, others, name, values):
+def test_value_at_its_limit_is_accepted(make, others, name, values):
     for value in values:
         made = make(**{**others, name: value})
         assert getattr(made, name, value) == value

@@ -30,7 +30,7 @@ FED_FORWARD = PidGains(
 
 @dataclass
 class Wheel:
-    """A hobby gear motor under a controller: 48 counts a turn, 30 to 1, 12 V."""
+    """A hobby gear motor under a controller: 48 counts per revolution, 30:1, 12 V."""
 
     settings: LoopSettings = field(default_factory=lambda: LoopSettings(gains=GAINS))
     counts: float = 48.0
@@ -41,7 +41,7 @@ class Wheel:
     see: Callable[[Sample, float], Sample] = lambda sample, t: sample
 
     def drive(self, target: float, seconds: float) -> WheelController:
-        """Drive at a set-point; keeps the true mean speed of the second half [rad/s]."""
+        """Drive at a set-point; store the true mean speed of the second half [rad/s]."""
         motor = MotorParameters.from_combinations(
             dc_gain=GAIN, time_constant=0.05, static_voltage=self.static
         )
@@ -67,31 +67,31 @@ class Wheel:
         return wheel
 
 
-def losing(share: float, since: float = 3.0) -> Callable[[Sample, float], Sample]:
-    """Return an encoder that shows a share of the speed from some time on."""
+def scaling_speed(share: float, since: float = 3.0) -> Callable[[Sample, float], Sample]:
+    """Return a sensor that scales the speed from a given time on."""
     return lambda s, t: s if t < since else s._replace(velocity=share * s.velocity)
 
 
 @pytest.mark.parametrize("share", [0.2, 0.3])
 @pytest.mark.parametrize(("gains", "since"), [(GAINS, 3.0), (FED_FORWARD, 0.0)])
-def test_an_encoder_that_loses_counts_is_suspected(gains, since, share):
+def test_encoder_losing_counts_is_reported_as_overload(gains, since, share):
     """linorobot/linorobot2 issue 154: "one of my encoder broken, so pid try to correct it"."""
-    wheel = Wheel(LoopSettings(gains=gains), see=losing(share, since)).drive(5.0, 10.0)
+    wheel = Wheel(LoopSettings(gains=gains), see=scaling_speed(share, since)).drive(5.0, 10.0)
     assert wheel.state is State.DRIVING and wheel.overload is not None
     voltage, needed = wheel.overload
     assert voltage > 11.0 and needed < 4.0
 
 
 @pytest.mark.parametrize("share", [0.0, 0.05])
-def test_an_encoder_that_shows_nothing_stops_the_wheel(share):
+def test_dead_or_nearly_dead_encoder_stops_the_wheel(share):
     """sonyccd/roboclaw_ros issue 4: no encoder, full PWM."""
-    wheel = Wheel(see=losing(share, 0.0)).drive(5.0, 5.0)
+    wheel = Wheel(see=scaling_speed(share, 0.0)).drive(5.0, 5.0)
     assert wheel.recovery.fault in (Fault.NO_MOTION, Fault.NOT_FOLLOWING)
 
 
 @pytest.mark.parametrize("target", [0.1, 1.0, 5.0, 15.0, 25.0])
 @pytest.mark.parametrize("gains", [GAINS, FED_FORWARD])
-def test_a_sound_wheel_is_not_suspected(gains, target):
+def test_intact_wheel_reports_no_overload(gains, target):
     wheel = Wheel(LoopSettings(gains=gains)).drive(target, 8.0)
     assert wheel.overload is None and wheel.recovery.failures == 0
 
@@ -100,7 +100,7 @@ def test_a_sound_wheel_is_not_suspected(gains, target):
 @pytest.mark.parametrize(
     ("source", "window"), [("measured", 4), ("difference", 4), ("difference", 1)]
 )
-def test_a_counter_that_wraps_against_its_description_is_unwrapped(source, window, bits):
+def test_undeclared_counter_wrap_is_detected_and_unwrapped(source, window, bits):
     """AIRclub-UdeSA/physical_rosmaster pull request 1: counters subtracted as they are."""
     gains = LoopSettings(gains=GAINS, speed_source=source, difference_window=window)
     one = Wheel(gains, counts=48.0 if bits == 8 else 4000.0, bits=bits, described_bits=0)
@@ -110,7 +110,7 @@ def test_a_counter_that_wraps_against_its_description_is_unwrapped(source, windo
 
 
 @pytest.mark.parametrize("window", [1, 4])
-def test_a_counter_that_starts_again_at_9000_kicks_no_wheel(window):
+def test_counter_wrapping_at_9000_does_not_disturb_the_wheel(window):
     """hoverboard-firmware-hack-FOC pull request 1: odometry in the range from 0 to 9000."""
     loop = replace(SETTINGS.loop, speed_source="difference", difference_window=window)
     world = World(replace(SETTINGS, loop=loop))
@@ -123,7 +123,7 @@ def test_a_counter_that_starts_again_at_9000_kicks_no_wheel(window):
     assert world.wheel.refused == {"feedback count that jumps": 7}, "once a turn"
 
 
-def test_steps_that_are_no_wraps_tell_no_width():
+def test_counter_width_is_not_inferred_from_steps_that_are_no_wraps():
     width = CounterWidth()
     counts = [0, 100, 205, 300, 100, -156, -420, -700, 40_000, 40_010, 40_021, -25_530]
     assert [width.step(count) for count in counts[:-1]] == [0] * 11
@@ -133,7 +133,7 @@ def test_steps_that_are_no_wraps_tell_no_width():
 
 @pytest.mark.parametrize("target", [0.005, 0.02, 0.1, 0.2])
 @pytest.mark.parametrize(("counts", "rate"), [(48.0, 100.0), (12.0, 50.0), (8.0, 20.0)])
-def test_a_wheel_near_zero_does_not_rocket_away(counts, rate, target):
+def test_wheel_does_not_run_away_at_set_points_near_zero(counts, rate, target):
     """RoverRobotics-archive/roverrobotics_ros2 issue 4: near zero it drives off at top speed."""
     one = Wheel(counts=counts, rate=rate)
     wheel = one.drive(target, 20.0)
@@ -142,7 +142,7 @@ def test_a_wheel_near_zero_does_not_rocket_away(counts, rate, target):
 
 
 @pytest.mark.parametrize("window", [1, 10])
-def test_pulses_that_come_one_by_one_drive_at_the_mean_that_is_asked(window):
+def test_mean_speed_is_tracked_with_single_pulses_per_sample(window):
     """waveshareteam/ugv_base_ros pull request 11: 0 or 1 pulse a tick, it cogs and stalls."""
     slow = LoopSettings(gains=GAINS, speed_source="difference", difference_window=window)
     one = Wheel(slow, counts=44.0, rate=200.0)
@@ -150,7 +150,7 @@ def test_pulses_that_come_one_by_one_drive_at_the_mean_that_is_asked(window):
     assert one.mean == pytest.approx(0.25, rel=0.1) and wheel.recovery.failures == 0
 
 
-def test_gains_for_10_hz_of_two_unlike_motors_follow():
+def test_gains_for_10_hz_track_with_different_static_friction():
     """ros-mobile-robots/diffbot issue 13: F 0.8, P 0.35, I 0.5, D 0.01, clamped, at 10 Hz."""
     gains = PidGains(p=0.35, i=0.5, d=0.01, feedforward_velocity=0.8, i_clamp_min=-3.5,
                      i_clamp_max=3.5, u_clamp_min=-6.0, u_clamp_max=6.0)  # fmt: skip

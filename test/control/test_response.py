@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The exact response against the matrix exponential, from oscillation to a pole long decayed."""
+"""The exact response compared with the matrix exponential, from complex to fast real poles."""
 
 import numpy as np
 import pytest
@@ -13,18 +13,18 @@ SHARES = (30.0, 1.0, 0.25, 0.2, 1e-3, 1e-6)
 
 
 def by_exponential(tau: float, tp: float, t: float) -> np.ndarray:
-    """Transition of speed, acceleration, angle and voltage, as one exponential in pieces."""
+    """Return the transition of speed, acceleration, angle and voltage by a scaled exponential."""
     A = np.zeros((4, 4))
     A[0, 1], A[2, 0] = 1.0, 1.0
     A[1] = [-1.0 / tp, -tau / tp, 0.0, GAIN / tp]
-    # Short enough that the largest entry of A t, scaled, loses no digits; then multiplied.
+    # Pieces short enough that the exponential loses no digits, then multiplied.
     pieces = 2 ** max(int(np.ceil(np.log2(max(t * tau / tp, 1.0)))), 0)
     return np.linalg.matrix_power(expm(A * t / pieces), pieces)
 
 
 @pytest.mark.parametrize("share", SHARES)
 @pytest.mark.parametrize("interval", [1e-4, 1e-3, 0.02])
-def test_held_response_is_the_matrix_exponential(share, interval):
+def test_zero_order_hold_response_matches_matrix_exponential(share, interval):
     tp = share * TAU**2
     held = zero_order_hold(GAIN, TAU, tp, interval)
     truth = by_exponential(TAU, tp, interval)
@@ -38,7 +38,7 @@ def test_held_response_is_the_matrix_exponential(share, interval):
     assert held.angle_forced[0] == pytest.approx(truth[2, 3], abs=1e-10)
 
 
-def test_a_decayed_pole_leaves_the_motor_of_first_order():
+def test_fast_electrical_pole_reduces_to_first_order_response():
     # With L/R of 1 ns and 50 ms the two differ by their ratio, 2e-8.
     second = zero_order_hold(GAIN, TAU, 1e-9 * TAU, 0.05)
     first = zero_order_hold(GAIN, TAU, 0.0, 0.05)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Loops made of the parts that run on the robot: speed sources, references, limits."""
+"""Simulated wheel loops with the robot's components: speed sources, references, limits."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -34,7 +34,7 @@ def settings_of(wheel: str, **changes) -> LoopSettings:
     return LoopSettings(**{"gains": gains, "transition_time": 0.2, "model": model, **changes})
 
 
-def test_open_loop_reaches_the_gain_of_the_motor():
+def test_open_loop_speed_matches_dc_gain():
     entry = MOTORS["rear_left"]
     run = simulate_open_loop(entry, lambda t: 8.0, 3.0)
     p = entry.parameters
@@ -42,7 +42,7 @@ def test_open_loop_reaches_the_gain_of_the_motor():
     assert run.velocity[-1] == pytest.approx(expected, rel=1e-6)
 
 
-def test_recorded_voltage_explains_the_recorded_motion_whatever_the_jitter_and_delay():
+def test_recorded_voltage_reproduces_motion_under_jitter_and_delay():
     from smp_motor_control.motor.friction import Motor
 
     entry = MOTORS["rear_left"]
@@ -52,7 +52,7 @@ def test_recorded_voltage_explains_the_recorded_motion_whatever_the_jitter_and_d
         motor = Motor(entry.parameters)
         for dt, voltage in zip(np.diff(run.time), run.voltage[1:]):
             motor.step(float(voltage), float(dt))
-        # Exact where a command holds a whole interval; its delay averages two within one.
+        # Exact if a command holds for a whole interval; a delay averages two of them.
         exact = timing.delay in (0.0, timing.sample_time) and timing.jitter == 0.0
         tolerance = 1e-6 if exact else 0.05
         assert entry.gearbox.to_wheel(motor.speed) == pytest.approx(run.velocity[-1], abs=tolerance)
@@ -60,7 +60,7 @@ def test_recorded_voltage_explains_the_recorded_motion_whatever_the_jitter_and_d
 
 @pytest.mark.parametrize("wheel", WHEELS)
 @pytest.mark.parametrize("source", ["measured", "difference", "observer"])
-def test_wheel_arrives_without_overshoot_by_every_speed_source(wheel, source):
+def test_step_overshoot_is_below_2_percent_with_every_speed_source(wheel, source):
     run = simulate_closed_loop(
         MOTORS[wheel],
         settings_of(wheel, speed_source=source, difference_window=2),
@@ -73,7 +73,7 @@ def test_wheel_arrives_without_overshoot_by_every_speed_source(wheel, source):
     assert np.all(np.abs(late - 2.0) < 0.02 * 2.0)
 
 
-def test_load_is_carried_by_the_integral():
+def test_integral_rejects_constant_load():
     run = simulate_closed_loop(
         MOTORS["rear_right"],
         settings_of("rear_right"),
@@ -84,7 +84,7 @@ def test_load_is_carried_by_the_integral():
     assert np.mean(run.velocity[run.time > 3.5]) == pytest.approx(1.5, rel=0.005)
 
 
-def test_same_seed_gives_the_same_run_and_another_another():
+def test_simulation_is_reproducible_by_seed():
     entry, drive = MOTORS["front_right"], DriveSettings(current_noise=0.05, torque_noise=1e-5)
     one, same, other = (
         simulate_open_loop(entry, lambda t: 5.0, 1.0, drive=drive, seed=seed) for seed in (1, 1, 2)
@@ -93,7 +93,7 @@ def test_same_seed_gives_the_same_run_and_another_another():
     assert not np.array_equal(one.current, other.current)
 
 
-def test_settings_change_without_a_jump_of_the_output():
+def test_settings_change_is_bumpless():
     loop = WheelLoop(settings_of("rear_left", transition_time=0.0))
     loop.start(1.0)
     for _ in range(50):
@@ -105,7 +105,7 @@ def test_settings_change_without_a_jump_of_the_output():
 
 
 @pytest.mark.parametrize("delays", [(0.0, 0.4), (0.4, 0.0)])
-def test_reference_delay_changes_while_driving_without_a_jump_of_the_reference(delays):
+def test_reference_delay_change_while_driving_is_bumpless(delays):
     before, after = (settings_of("rear_left", reference_delay=delay) for delay in delays)
     loop = WheelLoop(before)
     loop.start(0.0)
@@ -114,5 +114,5 @@ def test_reference_delay_changes_while_driving_without_a_jump_of_the_reference(d
     loop.configure(after)
     changed = [loop.step(1.5, 1.5, 0.005).output for _ in range(50)]
     assert loop.reference.velocity == pytest.approx(1.5)
-    # Without an error nothing is to change but the way in which the feed-forward is put together.
+    # Without a control error only the composition of the feed-forward changes.
     assert changed == pytest.approx([out.output] * 50, abs=0.1)

@@ -22,7 +22,7 @@ ROUNDING = 1e-9
 
 
 @given(v=st.floats(-3.0, 3.0), w=st.floats(-6.0, 6.0))
-def test_path_keeps_its_shape_when_a_wheel_cannot_follow(v, w):
+def test_wheel_speed_limit_preserves_path_curvature(v, w):
     left, right = ROBOT.limit_wheel_speeds(v, w)
     assert max(abs(left), abs(right)) <= 3.0 * (1.0 + ROUNDING)
     linear, angular = ROBOT.body_velocity(left, right)
@@ -31,7 +31,7 @@ def test_path_keeps_its_shape_when_a_wheel_cannot_follow(v, w):
     assert linear * v >= 0.0
 
 
-def test_command_within_reach_is_not_touched():
+def test_command_within_wheel_speed_limit_is_unchanged():
     assert ROBOT.limit_wheel_speeds(0.1, 0.2) == ROBOT.wheel_speeds(0.1, 0.2)
 
 
@@ -41,13 +41,13 @@ def test_radius_multipliers_act_on_their_side():
     assert robot.wheel_speeds(1.0, 0.0) == pytest.approx((20.0, 5.0))
 
 
-def test_sides_hold_the_wheels_of_the_contract():
+def test_sides_have_the_documented_wheel_names():
     assert LEFT == ("front_left", "rear_left")
     assert RIGHT == ("front_right", "rear_right")
 
 
 @pytest.mark.parametrize("bad", [math.nan, math.inf])
-def test_limiter_lets_nothing_through_that_is_not_finite(bad):
+def test_limiter_refuses_non_finite_input(bad):
     with pytest.raises(ParameterError, match="finite"):
         SpeedLimiter(max_velocity=1.0).limit(bad, 0.0, 0.0, 0.1)
     with pytest.raises(ParameterError, match="finite"):
@@ -66,13 +66,13 @@ def test_limiter_lets_nothing_through_that_is_not_finite(bad):
         {"min_jerk": 0.1, "max_jerk": 1.0},
     ],
 )
-def test_limits_with_which_a_body_cannot_stand_are_refused(limits):
+def test_limits_that_exclude_zero_are_refused(limits):
     with pytest.raises(ParameterError, match="enclose zero"):
         SpeedLimiter(**limits)
 
 
 @pytest.mark.parametrize(("low", "high"), [(0.0, 1.0), (-1.0, 0.0)])
-def test_a_body_of_one_direction_stands_or_drives(low, high):
+def test_velocity_is_clamped_to_one_sided_limit_including_zero(low, high):
     limiter = SpeedLimiter(min_velocity=low, max_velocity=high)
     for speed in (-0.5, 0.5):
         limited = limiter.limit(speed, speed, speed, 0.1).value
@@ -83,7 +83,7 @@ def make_odometry(**more: float) -> Odometry:
     return Odometry(wheel_separation=0.5, left_radius=0.1, right_radius=0.1, **more)
 
 
-def test_covariance_agrees_with_a_thousand_noisy_drives():
+def test_covariance_matches_monte_carlo_of_noisy_drives():
     travel_noise, turn_noise, steps, drives = 4e-4, 1e-2, 100, 1000
     rng = np.random.default_rng(5)
     # Every step: left 9 mm, right 11 mm, each with a variance of travel_noise per metre, and
@@ -113,7 +113,7 @@ def test_covariance_agrees_with_a_thousand_noisy_drives():
     assert predicted / np.outer(std, std) == pytest.approx(sampled / np.outer(std, std), abs=0.2)
 
 
-def test_heading_hold_straightens_a_body_that_drifts():
+def test_heading_hold_cancels_yaw_drift():
     hold, yaw, dt = HeadingHold(p=2.0, i=1.0), 0.0, 0.02
     for _ in range(1000):
         command = hold.step(0.0, yaw, dt)
@@ -122,7 +122,7 @@ def test_heading_hold_straightens_a_body_that_drifts():
     assert command == pytest.approx(-0.1, abs=1e-3)
 
 
-def test_a_speed_that_is_to_be_held_is_held_whatever_the_jerk():
+def test_jerk_limit_does_not_disturb_constant_speed():
     limiter = SpeedLimiter(max_jerk=1.0)
     assert limiter.limit_jerk(1.0, v0=1.0, v1=0.5, dt=0.1).value == 1.0
     assert limiter.limit_jerk(1.1, v0=1.0, v1=0.9, dt=0.1).value == pytest.approx(1.1)
@@ -130,19 +130,19 @@ def test_a_speed_that_is_to_be_held_is_held_whatever_the_jerk():
 
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])
-def test_a_saturated_heading_integral_unwinds_as_soon_as_the_error_turns(sign):
+def test_saturated_heading_integral_unwinds_when_error_changes_sign(sign):
     hold = HeadingHold(p=0.0, i=2.0, max_correction=0.5, max_error=3.0)
     hold.step(0.0, yaw=0.0, dt=0.05)
     for _ in range(100):
         saturated = hold.step(0.0, yaw=-0.4 * sign, dt=0.05)
     assert saturated == 0.5 * sign
     after = [hold.step(0.0, yaw=0.4 * sign, dt=0.05) for _ in range(40)]
-    # It has grown no further than to its limit and a step, 0.04, which takes two steps back.
+    # It exceeds its limit by at most one step, 0.04, which takes two steps to unwind.
     assert after[2] * sign < 0.5
     assert after[-1] == -0.5 * sign, "and winds up the other way"
 
 
-def test_heading_hold_follows_a_commanded_turn_across_the_wrap():
+def test_heading_hold_follows_commanded_turn_across_angle_wrap():
     hold, yaw, dt = HeadingHold(p=2.0, i=0.5), 3.0, 0.02
     for _ in range(500):
         yaw = math.remainder(yaw + 0.9 * hold.step(0.5, yaw, dt) * dt, 2.0 * math.pi)
@@ -150,7 +150,7 @@ def test_heading_hold_follows_a_commanded_turn_across_the_wrap():
     assert math.remainder(yaw - 3.0 - 5.0, 2.0 * math.pi) == pytest.approx(0.0, abs=0.02)
 
 
-def test_heading_hold_gives_in_when_the_body_is_turned_by_hand():
+def test_heading_hold_resets_on_error_above_maximum():
     hold = HeadingHold(max_error=0.7)
     hold.step(0.0, 0.0, 0.02)
     assert hold.step(0.0, 0.1, 0.02) < 0.0, "which begins an integral"
@@ -158,7 +158,7 @@ def test_heading_hold_gives_in_when_the_body_is_turned_by_hand():
     assert hold.step(0.0, 2.0, 0.02) == 0.0
 
 
-def test_heading_hold_never_corrects_by_more_than_allowed_or_with_nan():
+def test_heading_correction_is_limited_and_skipped_for_nan_yaw():
     hold = HeadingHold(p=10.0, i=10.0, max_correction=0.3)
     hold.step(0.0, 0.0, 0.02)
     for _ in range(100):

@@ -28,7 +28,7 @@ GAINS = PidGains(
 
 
 class Motor:
-    """A geared motor with dry friction, by steps of a fiftieth of a sample, one sample late."""
+    """A geared motor with dry friction and one sample of delay, in 50 steps per sample."""
 
     def __init__(self, load: float = 0.0) -> None:
         self.speed = self.rate = self.angle = self.late = 0.0
@@ -50,8 +50,8 @@ class Motor:
         return math.floor(self.angle * COUNTS / (2 * math.pi))
 
 
-def driven(setpoints: np.ndarray, load: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
-    """Return voltages and counts of a wheel that an observer's loop drives."""
+def simulate(setpoints: np.ndarray, load: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
+    """Return voltages and counts of a wheel under a loop with an observer."""
     settings = LoopSettings(
         gains=GAINS, speed_source="observer", difference_window=1, transition_time=0.01,
         model=MODEL, noise=ObserverNoise(),
@@ -67,22 +67,22 @@ def driven(setpoints: np.ndarray, load: float = 0.0) -> tuple[np.ndarray, np.nda
     return out[:, 0], out[:, 1]
 
 
-def stops(seed: int) -> np.ndarray:
+def stop_profile(seed: int) -> np.ndarray:
     level = np.random.default_rng(seed).uniform(2.0, 8.0)
     return np.concatenate([np.zeros(100), np.full(700, level), np.zeros(2_000)])
 
 
-def test_a_wheel_that_rocks_by_a_count_is_left_alone(monkeypatch):
-    ends = [driven(stops(seed))[0][-1_000:] for seed in range(6)]
+def test_voltage_is_constant_at_standstill_despite_one_count_flicker(monkeypatch):
+    ends = [simulate(stop_profile(seed))[0][-1_000:] for seed in range(6)]
     assert max(np.ptp(end) for end in ends) < 1e-9  # from a second after the stop
     monkeypatch.setattr(standstill, "STANDSTILL_TIME_S", math.inf)
-    ends = [driven(stops(seed))[0][-1_000:] for seed in range(6)]
+    ends = [simulate(stop_profile(seed))[0][-1_000:] for seed in range(6)]
     assert max(np.ptp(end) for end in ends) > 0.2  # [V], without the rule
 
 
-def test_it_stands_under_a_load_and_turns_again_when_asked():
-    again = np.concatenate([stops(1), np.full(1_000, -3.0), np.zeros(1_500)])
-    voltage, count = driven(again, load=0.5)
+def test_wheel_holds_against_load_and_restarts_on_set_point():
+    again = np.concatenate([stop_profile(1), np.full(1_000, -3.0), np.zeros(1_500)])
+    voltage, count = simulate(again, load=0.5)
     assert np.ptp(count[1_800:2_800]) <= 1 and np.ptp(voltage[1_800:2_800]) < 1e-9
     assert abs(voltage[2_700] - 0.5) <= STATIC * 1.05
     turned = (count[3_700] - count[3_200]) * 2 * math.pi / COUNTS / GEAR / 0.5
@@ -90,7 +90,7 @@ def test_it_stands_under_a_load_and_turns_again_when_asked():
     assert np.ptp(count[4_300:]) <= 1
 
 
-def test_one_count_is_standing_and_two_are_not():
+def test_standstill_tolerates_one_count_and_ends_at_two():
     still = Standstill()
     for k in range(round(STANDSTILL_TIME_S / STEP) - 1):
         assert still.voltage(k % 2) is None
@@ -104,8 +104,8 @@ def test_one_count_is_standing_and_two_are_not():
 
 
 @pytest.mark.parametrize("source", ["observer", "measured"])
-def test_a_voltage_that_is_not_needed_fades_and_one_that_is_stays(source):
-    """Friction holds a wheel with any voltage within it: the integral's would heat the motor."""
+def test_unneeded_integral_voltage_decays_at_standstill(source):
+    """Dry friction holds a wheel at any voltage below it; a leftover integral heats the motor."""
     for load, left in ((0.0, 0.0), (0.5, 0.5)):
         settings = LoopSettings(gains=GAINS, speed_source=source, model=MODEL)
         loop = WheelLoop(settings, Gearbox(GEAR), Encoder(COUNTS), 9.0)
@@ -119,4 +119,4 @@ def test_a_voltage_that_is_not_needed_fades_and_one_that_is_stays(source):
             if not math.isnan(speed):
                 voltage = loop.step(0.0, speed, STEP).output
         assert abs(voltage - left) <= 1.05 * STATIC * (load > 0)
-        assert abs(count - first) <= 5 and motor.speed == 0.0  # it is caught, if it slips
+        assert abs(count - first) <= 5 and motor.speed == 0.0  # a slip is caught

@@ -1,12 +1,22 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A wheel stands within ``stop_time`` of a zero set-point or of silence, whatever its settings."""
+"""A wheel stops within ``stop_time`` of a zero set-point or of silence, with any settings."""
 
 import math
 import random
 from dataclasses import replace
 
 import pytest
-from wheel_world import DT, GAIN, GAINS, SETPOINT_TIMEOUT, SETTINGS, SUPPLY, TAU, World, silent
+from wheel_world import (
+    DT,
+    GAIN,
+    GAINS,
+    SETPOINT_TIMEOUT,
+    SETTINGS,
+    SUPPLY,
+    TAU,
+    World,
+    stop_set_points,
+)
 
 from smp_motor_control.errors import ParameterError
 from smp_motor_control.motor.parameters import Gearbox, MotorModel
@@ -19,23 +29,23 @@ from smp_motor_control.wheel.stop import AVERAGING_WINDOW_S, REST_SPEED, STANDST
 
 MODEL = MotorModel(dc_gain=GAIN * 65.5, time_constant=TAU)
 KNOWN = OperatingConditions(sample_time=DT, supply=SUPPLY, gearbox=Gearbox(65.5))
-UNHURRIED = {
+SLOW_SETTINGS = {
     "drive": {"drive": Drive(top_speed=3.0, time_constant=1e5)},
     "delay": {"reference_delay": 10.0},
-    "doubt": {"reference_delay": 0.1, "reference_delay_uncertainty": 1.0},
+    "delay_uncertainty": {"reference_delay": 0.1, "reference_delay_uncertainty": 1.0},
     "transition": {"transition_time": 60.0},
     "acceleration": {"limits": ProfileLimits(acceleration=0.01)},
     "jerk": {"limits": ProfileLimits(jerk=0.01)},
 }
-"""Settings that lead a wheel to a standstill in more than a second."""
+"""Settings whose reference takes more than a second to reach zero."""
 
 
 def settings(gains: PidGains = GAINS, stop_time: float = 1.0, **loop: object) -> WheelSettings:
     return replace(SETTINGS, loop=LoopSettings(gains=gains, stop_time=stop_time, **loop))
 
 
-def driving(world: World, speed: float = 1.5) -> World:
-    """Turn a wheel at a speed, its reference with it, however slowly that would get there."""
+def start_at_speed(world: World, speed: float = 1.5) -> World:
+    """Start a wheel and its reference at a speed."""
     world.setpoint = speed
     world.run(0.1)
     world.speed = speed
@@ -44,12 +54,12 @@ def driving(world: World, speed: float = 1.5) -> World:
 
 
 @pytest.mark.parametrize("stop_time", [0.5, 1.0])
-@pytest.mark.parametrize("name", UNHURRIED)
-def test_a_reference_that_is_led_too_slowly_ends_at_the_stop_time(name, stop_time):
-    world = driving(World(settings(stop_time=stop_time, **UNHURRIED[name])))
+@pytest.mark.parametrize("name", SLOW_SETTINGS)
+def test_slow_reference_is_zero_at_stop_time(name, stop_time):
+    world = start_at_speed(World(settings(stop_time=stop_time, **SLOW_SETTINGS[name])))
     assert world.speed > 1.0
     world.setpoint = 0.0
-    # Then the reference is zero, and the rest is the loop's own response.
+    # The reference is zero then; the remaining motion is the loop's response.
     world.run(stop_time + 2 * DT)
     assert world.wheel.loop.reference.velocity == 0.0 and world.held <= 0.0
     world.run(8 * TAU)
@@ -58,10 +68,10 @@ def test_a_reference_that_is_led_too_slowly_ends_at_the_stop_time(name, stop_tim
     assert abs(world.speed) < REST_SPEED and world.wheel.state is State.DRIVING
 
 
-@pytest.mark.parametrize("name", UNHURRIED)
-def test_silence_ends_in_0_v_after_its_time_out_and_the_stop_time(name):
-    world = driving(World(settings(**UNHURRIED[name])))
-    silent(world)
+@pytest.mark.parametrize("name", SLOW_SETTINGS)
+def test_voltage_is_zero_after_set_point_time_out_and_stop_time(name):
+    world = start_at_speed(World(settings(**SLOW_SETTINGS[name])))
+    stop_set_points(world)
     world.run(SETPOINT_TIMEOUT + 1.0 + 2 * DT)
     assert world.held == 0.0 and world.wheel.setpoint is None
     world.run(6 * TAU)
@@ -76,7 +86,7 @@ def test_silence_ends_in_0_v_after_its_time_out_and_the_stop_time(name):
         replace(GAINS, p=0.01, i=1e-6),
     ],
 )
-def test_an_integral_that_would_drive_on_is_dropped(gains):
+def test_integral_that_keeps_driving_after_stop_is_cleared(gains):
     blind = replace(SETTINGS.faults, tracking_time=0.0)
     world = World(replace(settings(), faults=blind)).run(2.0)
     # No jump: the integral takes over the contribution of the other terms.
@@ -90,7 +100,7 @@ def test_an_integral_that_would_drive_on_is_dropped(gains):
     assert "integral" in why and world.wheel.state is State.DRIVING
 
 
-def test_a_slope_is_held_and_pushing_by_hand_is_not_driving():
+def test_integral_that_holds_against_slope_or_push_is_kept():
     world = World().run(2.0)
     world.load = 3.0
     world.setpoint = 0.0
@@ -103,7 +113,7 @@ def test_a_slope_is_held_and_pushing_by_hand_is_not_driving():
     assert max(abs(speed) for _, _, speed in world.log[-100:]) < REST_SPEED
 
 
-def test_a_wheel_that_rolls_after_a_fault_does_not_say_that_it_is_driven():
+def test_rolling_after_a_fault_is_not_reported_as_driving():
     world = World().run(2.0)
     world.blocked = True
     world.until(lambda: world.wheel.recovery.fault is not None, 1.5)
@@ -116,8 +126,8 @@ def test_a_wheel_that_rolls_after_a_fault_does_not_say_that_it_is_driven():
     assert world.wheel.state is State.DRIVING
 
 
-def test_the_offset_of_a_joystick_at_rest_counts_as_zero():
-    world = driving(World(settings(**UNHURRIED["transition"])))
+def test_joystick_offset_counts_as_zero_set_point():
+    world = start_at_speed(World(settings(**SLOW_SETTINGS["transition"])))
     for k in range(round(1.2 / DT)):
         world.setpoint = (0.0, 0.9 * STANDSTILL_SETPOINT, -0.9 * STANDSTILL_SETPOINT)[k % 3]
         world.step()
@@ -126,35 +136,35 @@ def test_the_offset_of_a_joystick_at_rest_counts_as_zero():
 
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])
-def test_the_offset_of_a_joystick_gets_no_feed_forward_of_friction(sign):
+def test_joystick_offset_gets_no_friction_feed_forward(sign):
     world = World(settings(PidGains(feedforward_static=3.0, u_clamp_min=-12.0, u_clamp_max=12.0)))
     world.setpoint = sign * STANDSTILL_SETPOINT
     world.run(1.0)
     assert world.held == 0.0 and world.speed == 0.0
 
 
-def test_a_slow_set_point_does_not_count_as_zero():
+def test_slow_set_point_does_not_count_as_zero():
     world = World().run(2.0)
     world.setpoint = 0.1
     world.run(5.0)
     assert world.speed == pytest.approx(0.1, rel=0.01)
 
 
-@pytest.mark.parametrize("name", UNHURRIED)
-def test_settings_that_stop_too_late_are_refused_with_the_time_they_take(name):
+@pytest.mark.parametrize("name", SLOW_SETTINGS)
+def test_settings_exceeding_stop_time_are_refused_with_their_duration(name):
     with pytest.raises(ParameterError, match=r"stops .* s after a set-point of zero, and stop_"):
-        check(settings(**UNHURRIED[name]).loop)
+        check(settings(**SLOW_SETTINGS[name]).loop)
 
 
 @pytest.mark.parametrize("name", ["transition_time", "reference_delay"])
-def test_settings_are_taken_up_to_the_stop_time(name):
+def test_settings_up_to_stop_time_are_accepted(name):
     check(settings(**{name: 1.0}).loop)
     with pytest.raises(ParameterError, match=f"{name} 1.002"):
         check(settings(**{name: 1.002}).loop)
     check(settings(stop_time=1.1, **{name: 1.002}).loop)
 
 
-def test_the_speed_that_is_braked_from_is_the_fastest_that_is_known():
+def test_stop_time_is_checked_from_the_highest_reachable_speed():
     known, loop = KNOWN, LoopSettings(gains=GAINS, model=MODEL)
     top = GAIN * SUPPLY  # 4.32 rad/s
     check(replace(loop, limits=ProfileLimits(acceleration=1.02 * top)), known)
@@ -170,7 +180,7 @@ def test_the_speed_that_is_braked_from_is_the_fastest_that_is_known():
 
 
 @pytest.mark.parametrize(("low", "high"), [(1.0, 12.0), (-12.0, -1e-3), (5e-324, math.inf)])
-def test_clamps_that_leave_no_zero_are_refused(low, high):
+def test_clamps_that_exclude_zero_are_refused(low, high):
     clamped = replace(GAINS, u_clamp_min=low, u_clamp_max=high)
     with pytest.raises(ParameterError, match="drives the wheel at a set-point of zero"):
         check(LoopSettings(gains=clamped))
@@ -178,7 +188,7 @@ def test_clamps_that_leave_no_zero_are_refused(low, high):
     check(LoopSettings(gains=replace(GAINS, u_clamp_max=0.0)))
 
 
-def test_a_stop_begins_again_after_a_reset():
+def test_wheel_drives_again_after_reset_at_standstill():
     world = World().run(1.0)
     world.setpoint = 0.0
     world.run(5.0)
@@ -189,7 +199,7 @@ def test_a_stop_begins_again_after_a_reset():
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_whatever_is_accepted_stands_in_time(seed):
+def test_random_accepted_settings_stop_within_stop_time(seed):
     draw, stood = random.Random(seed), 0
     for _ in range(60):
         gains = replace(GAINS, p=10 ** draw.uniform(-2, 1), i=10 ** draw.uniform(-4, 2))
@@ -213,7 +223,7 @@ def test_whatever_is_accepted_stands_in_time(seed):
             continue
         world = World(replace(settings(), loop=loop)).run(3.0)
         world.setpoint = 0.0
-        # A window to see that an integral drives, and the motor's own time to come to rest.
+        # A window to detect a driving integral, and the motor's time to come to rest.
         world.run(loop.stop_time + AVERAGING_WINDOW_S + 10 * TAU)
         last = [abs(speed) for _, _, speed in world.log[-round(0.2 / DT) :]]
         assert max(last) < max(REST_SPEED, 0.1), loop

@@ -18,7 +18,7 @@ def clock() -> FeedbackClock:
 
 
 def feed(c: FeedbackClock, *instants: tuple[float, float]) -> list[Verdict]:
-    """Stamps and arrivals in milliseconds."""
+    """Feed samples with stamps and arrivals in milliseconds; return their verdicts."""
     return [c.accept(START + round(s * MS), START + round(a * MS)) for s, a in instants]
 
 
@@ -30,14 +30,14 @@ def test_steady_feedback_is_fresh_and_dt_comes_from_the_stamps():
     assert c.age == pytest.approx(0.003, abs=1e-9)
 
 
-def test_duplicates_and_reordered_samples_are_told_apart_and_left_out():
+def test_duplicate_and_reordered_samples_are_distinguished_and_skipped():
     c = clock()
     verdicts = feed(c, (0, 0), (5, 5), (5, 6), (15, 15), (10, 16), (20, 20))
     assert verdicts[2] is Verdict.DUPLICATE and verdicts[4] is Verdict.REORDERED
     assert verdicts[5] is Verdict.FRESH and c.dt == pytest.approx(0.005)
 
 
-def test_lost_samples_lengthen_dt_until_the_gap_is_too_long():
+def test_lost_samples_lengthen_dt_up_to_the_maximum_gap():
     c = clock()
     assert feed(c, (0, 0), (5, 5), (150, 150))[2] is Verdict.FRESH
     assert c.dt == pytest.approx(0.145)
@@ -45,7 +45,7 @@ def test_lost_samples_lengthen_dt_until_the_gap_is_too_long():
 
 
 @pytest.mark.parametrize("from_the_start", [True, False])
-def test_feedback_delayed_by_half_a_second_is_late_as_long_as_it_is(from_the_start):
+def test_feedback_delayed_by_half_a_second_is_late_while_delayed(from_the_start):
     c = clock()
     if not from_the_start:
         feed(c, *((5 * k, 5 * k) for k in range(10)))
@@ -55,7 +55,7 @@ def test_feedback_delayed_by_half_a_second_is_late_as_long_as_it_is(from_the_sta
 
 
 @pytest.mark.parametrize("jump", [-10_000, 10_000, -1_500, 86_400_000])
-def test_clock_that_jumps_costs_one_sample_and_there_and_back_is_learnt(jump):
+def test_clock_jump_and_its_reversal_cost_one_sample_each(jump):
     c = clock()
     feed(c, (0, 0), (5, 5))
     there = feed(c, *((jump + 10 + 5 * k, 10 + 5 * k) for k in range(5)))
@@ -64,7 +64,7 @@ def test_clock_that_jumps_costs_one_sample_and_there_and_back_is_learnt(jump):
     assert c.jumps == 2 and c.offset == 0.0
 
 
-def test_hardware_whose_clock_was_never_set_is_used_with_its_offset():
+def test_offset_of_unset_hardware_clock_is_learnt():
     c = clock()
     verdicts = [c.accept(k * 5 * MS + 1, START + k * 5 * MS) for k in range(5)]
     assert verdicts[1:] == [Verdict.FRESH] * 4
@@ -73,39 +73,39 @@ def test_hardware_whose_clock_was_never_set_is_used_with_its_offset():
     assert late is Verdict.LATE
 
 
-def test_zero_stamps_stand_for_the_arrival():
+def test_zero_stamps_are_replaced_by_arrival_time():
     c = clock()
     assert [c.accept(0, START + k * 5 * MS) for k in range(3)][-1] is Verdict.FRESH
     assert c.dt == pytest.approx(0.005)
 
 
-def test_stamps_that_go_on_are_late_however_late_and_no_clock_that_was_set_back():
+def test_growing_queue_is_late_feedback_and_not_a_clock_jump():
     c = clock()
     feed(c, (0, 0), (5, 5))
-    # A queue that grows to two seconds: the samples follow on each other, their arrival does not.
+    # The queue grows to two seconds: stamps are consecutive, arrivals are delayed.
     assert set(feed(c, *((10 + 5 * k, 2010 + 5 * k) for k in range(20)))) == {Verdict.LATE}
     assert (c.jumps, c.offset, c.age) == (0, 0.0, pytest.approx(2.0))
     assert feed(c, (2200, 2200), (2205, 2205)) == [Verdict.FIRST, Verdict.FRESH]
-    # Until someone resets: then it is taken for the offset of another clock.
+    # After a reset the delay is taken for a clock offset.
     feed(c, (2210, 4210))
     c.reset()
     assert feed(c, (2215, 4215), (2220, 4220)) == [Verdict.FIRST, Verdict.FRESH]
     assert c.offset == pytest.approx(2.0) and c.age == pytest.approx(0.0)
 
 
-def test_clock_that_jumps_ahead_or_after_a_gap_is_a_jump():
+def test_forward_clock_jump_and_jump_after_gap_are_detected():
     c = clock()
     feed(c, (0, 0), (5, 5))
     assert feed(c, (1600, 10)) == [Verdict.FIRST]
     assert c.age == 0.0, "counted from the new offset on"
     assert feed(c, (1605, 15)) == [Verdict.FRESH]
     assert c.jumps == 1 and c.offset == pytest.approx(-1.59) and c.age == pytest.approx(0.0)
-    # Three seconds of silence with one by the stamps: more than a gap, so not a queue.
+    # Three seconds of silence, one second by the stamps: longer than a gap, so not a queue.
     assert feed(c, (2605, 3015)) == [Verdict.FIRST]
     assert c.jumps == 2 and c.offset == 0.0 and c.age == pytest.approx(0.41)
 
 
-def test_offset_is_learnt_anew_when_the_computers_clock_is_set():
+def test_clock_offset_is_relearnt_when_computer_clock_is_set():
     c = clock()
     for k in range(3):
         assert c.accept(START + 5 * k * MS, START + 5 * k * MS, 7.0 + 0.005 * k)
@@ -118,7 +118,7 @@ def test_offset_is_learnt_anew_when_the_computers_clock_is_set():
     assert c.accept(START + 25 * MS, START + 10_025 * MS, 12.0) is Verdict.LATE
 
 
-def test_a_new_clock_has_measured_nothing():
+def test_new_feedback_clock_has_zero_counts_and_offset():
     c = clock()
     assert (c.jumps, c.offset, c.dt, c.age) == (0, 0.0, 0.0, 0.0)
     assert c.counts == dict.fromkeys(Verdict, 0)
@@ -133,13 +133,13 @@ def test_samples_are_counted_by_verdict():
     assert {verdict.name: n for verdict, n in c.counts.items()} == expected
 
 
-def test_ages_and_gaps_count_up_to_their_limits():
+def test_age_and_gap_limits_are_inclusive():
     c = FeedbackClock(max_age=0.25, max_gap=0.5)  # binary fractions: nothing is rounded
     assert feed(c, (0, 250), (500, 750)) == [Verdict.FIRST, Verdict.FRESH]
     assert feed(c, (1001, 1001), (1002, 1253)) == [Verdict.FIRST, Verdict.LATE]
 
 
-def test_after_a_reset_the_next_sample_is_a_first_one():
+def test_next_sample_after_reset_is_a_first_sample():
     c = clock()
     feed(c, (0, 0), (5, 5))
     c.reset()
@@ -152,7 +152,7 @@ def lease(*commands: tuple[str, float, float], timeout: float = 0.2) -> list[boo
     return [one.take(writer, voltage, now) for writer, voltage, now in commands]
 
 
-def test_a_wheel_is_its_last_drivers_for_the_time_out_and_no_longer():
+def test_lease_lasts_one_time_out_after_last_nonzero_command():
     taken = lease(
         ("a", 1.0, 0.0), ("b", 1.0, 0.125), ("b", 0.0, 0.125), ("b", 1.0, 0.25), timeout=0.25
     )
@@ -164,7 +164,7 @@ def test_a_wheel_is_its_last_drivers_for_the_time_out_and_no_longer():
     assert lease(("a", 1.0, 0.0), ("a", -1.0, 0.15), ("b", 1.0, 0.21)) == [True, True, False]
 
 
-def test_the_owner_is_named_while_its_lease_lives_and_refused_writers_are_counted():
+def test_lease_reports_owner_and_counts_refused_writers():
     one = Lease(0.2)
     assert one.owner(0.0) == "" and one.refused == {}
     one.take("a", 1.0, 1.0)
@@ -175,13 +175,13 @@ def test_the_owner_is_named_while_its_lease_lives_and_refused_writers_are_counte
     assert one.refused == {"b": 3, "c": 1}
 
 
-def test_a_lease_ends_where_commands_never_do():
+def test_lease_ends_after_one_second_with_infinite_time_out():
     one = Lease(math.inf)
     one.take("a", 1.0, 0.0)
     assert one.owner(0.999) == "a" and one.owner(1.0) == ""
 
 
-def test_a_command_that_waited_in_a_queue_takes_no_wheel_but_zero_always_does():
+def test_outdated_queued_commands_are_refused_unless_zero():
     one = Lease(0.2)
     ms = 1_000_000
 
@@ -202,7 +202,7 @@ def test_a_command_that_waited_in_a_queue_takes_no_wheel_but_zero_always_does():
     assert at(9500, 3.0, 9500, "c") and at(10_000, 3.0, 9600, "c") and at(10_600, 3.0, 10_500, "a")
 
 
-def test_as_many_writers_are_known_as_a_robot_may_have_and_no_more():
+def test_clock_offsets_of_64_recent_writers_are_remembered():
     def judged(others: int, again: int = 0) -> bool:
         """Tell whether a late command is refused after commands of others."""
         one = Lease(0.2)
@@ -215,11 +215,11 @@ def test_as_many_writers_are_known_as_a_robot_may_have_and_no_more():
         return not one.take("late", 3.0, 6.8, 50_300 * MS, 6800 * MS)
 
     assert judged(63) and not judged(64)
-    # Who was heard since is not the one that is forgotten.
+    # A writer heard recently is not the one to be forgotten.
     assert judged(63, again=1)
 
 
-def test_refused_writers_are_counted_apart_up_to_as_many():
+def test_refused_writers_are_counted_individually_up_to_64():
     one = Lease(0.2)
     one.take("owner", 3.0, 1.0)
     for k in range(1000):
@@ -233,7 +233,7 @@ LIMITS = FaultLimits(current_limit=3.0, current_time=0.05)
 
 
 def follow(speed, reference=2.0, saturated=False, kv=math.nan) -> tuple[float, Fault | None]:
-    """Step at 200 Hz under 12 V for two seconds; return when a fault shows, and which."""
+    """Step at 200 Hz under 12 V for two seconds; return the time of the fault and the fault."""
     detector = FaultDetector(LIMITS)
     detector.volts_per_speed = kv
     for k in range(400):
@@ -262,7 +262,7 @@ def follow(speed, reference=2.0, saturated=False, kv=math.nan) -> tuple[float, F
         (lambda t: 1.0, {"reference": 10.0, "saturated": True}, Fault.NOT_FOLLOWING),
     ],
 )
-def test_wheel_that_does_not_follow_is_found_in_half_a_second(speed, options, fault):
+def test_tracking_fault_is_detected_within_half_a_second(speed, options, fault):
     instant, found = follow(speed, **options)
     assert found is fault
     assert instant <= 0.5 or fault is None

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The fault matrix of one wheel, event by event, with the time passed in."""
+"""The fault matrix of one wheel, event by event, in simulated time."""
 
 import math
 from dataclasses import replace
@@ -14,14 +14,14 @@ from wheel_world import (
     SETTINGS,
     TAU,
     World,
-    asking,
-    block,
-    change,
-    delay,
-    lose,
-    sensible,
-    silent,
-    taken,
+    block_wheel,
+    change_feedback,
+    clear_faults,
+    delay_feedback,
+    lose_feedback,
+    send_set_point,
+    set_other_owner,
+    stop_set_points,
 )
 
 from smp_motor_control.encoder import Encoder
@@ -30,29 +30,29 @@ from smp_motor_control.wheel.controller import State
 from smp_motor_control.wheel.faults import Fault
 from smp_motor_control.wheel.loop import LoopSettings
 
-FRONT = 0.02  # one sample to see it, one for the answer
+FRONT = 0.02  # one sample to detect it, one for the answer
 MATRIX = [
-    # what happens, how it is named, within, 0 V within, drives again within
-    ("feedback lost", lose, "no feedback", FEEDBACK_TIMEOUT, FEEDBACK_TIMEOUT, 1.0),
-    ("feedback late", delay, "late", 0.55, FEEDBACK_TIMEOUT, 1.0),
-    ("velocity nan", change(velocity=math.nan), "not a number", 0.2, 0.2, 1.0),
-    ("velocity inf", change(velocity=math.inf), "not a number", 0.2, 0.2, 1.0),
-    ("velocity absurd", change(velocity=1e9), "not a number", 0.2, 0.2, 1.0),
-    ("encoder dead", change(velocity=0.0), "no counts", 0.85, 0.85, 1.0),
-    ("wheel blocked", block, "no counts", 0.85, 0.85, 3.0),
-    ("leads swapped", change(velocity=lambda v: -v), "runaway", 0.5, 0.5, 3.0),
-    ("sticks at 0.2", change(velocity=0.2), "does not follow", 0.5, 0.5, 3.0),
-    ("over-current", change(current=9.0), "over-current", 0.15, 0.15, 3.0),
-    ("set-points cease", silent, "set-point timed out", 0.53, 1.0, 1.0),
-    ("set-point nan", asking(math.nan), "set-point timed out", 0.53, 1.0, 1.0),
-    ("set-point inf", asking(math.inf), "set-point timed out", 0.53, 1.0, 1.0),
-    ("set-point absurd", asking(-1e300), "set-point timed out", 0.53, 1.0, 1.0),
-    ("another's wheel", taken, "rejected", FRONT, FRONT, 1.0),
+    # event, injected fault, diagnosis, time to diagnosis, time to 0 V, time to recovery
+    ("feedback lost", lose_feedback, "no feedback", FEEDBACK_TIMEOUT, FEEDBACK_TIMEOUT, 1.0),
+    ("feedback late", delay_feedback, "late", 0.55, FEEDBACK_TIMEOUT, 1.0),
+    ("velocity nan", change_feedback(velocity=math.nan), "not a number", 0.2, 0.2, 1.0),
+    ("velocity inf", change_feedback(velocity=math.inf), "not a number", 0.2, 0.2, 1.0),
+    ("velocity absurd", change_feedback(velocity=1e9), "not a number", 0.2, 0.2, 1.0),
+    ("encoder dead", change_feedback(velocity=0.0), "no counts", 0.85, 0.85, 1.0),
+    ("wheel blocked", block_wheel, "no counts", 0.85, 0.85, 3.0),
+    ("leads swapped", change_feedback(velocity=lambda v: -v), "runaway", 0.5, 0.5, 3.0),
+    ("sticks at 0.2", change_feedback(velocity=0.2), "does not follow", 0.5, 0.5, 3.0),
+    ("over-current", change_feedback(current=9.0), "over-current", 0.15, 0.15, 3.0),
+    ("set-points cease", stop_set_points, "set-point timed out", 0.53, 1.0, 1.0),
+    ("set-point nan", send_set_point(math.nan), "set-point timed out", 0.53, 1.0, 1.0),
+    ("set-point inf", send_set_point(math.inf), "set-point timed out", 0.53, 1.0, 1.0),
+    ("set-point absurd", send_set_point(-1e300), "set-point timed out", 0.53, 1.0, 1.0),
+    ("another's wheel", set_other_owner, "rejected", FRONT, FRONT, 1.0),
 ]
 
 
 @pytest.mark.parametrize("row", MATRIX, ids=[row[0] for row in MATRIX])
-def test_every_fault_is_named_stops_the_wheel_in_time_and_passes(row):
+def test_every_fault_is_reported_stops_the_wheel_in_time_and_clears(row):
     _, put, words, clamp_to_supply, stopped, again = row
     limits = replace(SETTINGS.faults, current_limit=5.0)
     world = World(replace(SETTINGS, faults=limits)).run(2.0)
@@ -61,21 +61,21 @@ def test_every_fault_is_named_stops_the_wheel_in_time_and_passes(row):
     begin = world.now
     world.until(lambda: words in world.named(), clamp_to_supply + FRONT)
     world.until(lambda: world.held == 0.0, stopped + FRONT - (world.now - begin) + DT)
-    sensible(world)
-    # Ten time constants to speed, after the pause and the small voltage of a try.
+    clear_faults(world)
+    # Ten time constants to reach the speed, after the pause and the low voltage of a retry.
     world.until(lambda: abs(world.speed - 1.5) < 0.15, again + 10 * TAU)
 
 
 @pytest.mark.parametrize(
     ("put", "fault"),
     [
-        (change(velocity=lambda v: -v), Fault.RUNAWAY),
-        (change(velocity=lambda v: -v, encoder_count=lambda n: -n), Fault.RUNAWAY),
-        (block, Fault.NO_MOTION),
-        (change(velocity=0.2), Fault.NOT_FOLLOWING),
+        (change_feedback(velocity=lambda v: -v), Fault.RUNAWAY),
+        (change_feedback(velocity=lambda v: -v, encoder_count=lambda n: -n), Fault.RUNAWAY),
+        (block_wheel, Fault.NO_MOTION),
+        (change_feedback(velocity=0.2), Fault.NOT_FOLLOWING),
     ],
 )
-def test_fault_that_stays_is_tried_three_times_gently_and_then_latched(put, fault):
+def test_persistent_fault_is_retried_three_times_at_low_voltage_then_latched(put, fault):
     world = World().run(2.0)
     put(world)
     world.until(lambda: world.wheel.recovery.fault is not None, 1.0)
@@ -86,7 +86,7 @@ def test_fault_that_stays_is_tried_three_times_gently_and_then_latched(put, faul
     assert max(tried) <= 1.05 * SETTINGS.faults.stall_voltage
     starts = sum(a == 0.0 != b for a, b in pairwise(tried))
     assert starts == 3
-    sensible(world)
+    clear_faults(world)
     world.run(10.0)
     assert world.held == 0.0, "a latched wheel waits for a person"
     world.setpoint = 0.0
@@ -98,9 +98,9 @@ def test_fault_that_stays_is_tried_three_times_gently_and_then_latched(put, faul
     world.until(lambda: abs(world.speed - 1.5) < 0.15, 1.0)
 
 
-def test_nothing_is_driven_at_a_zero_set_point_after_a_runaway():
+def test_voltage_stays_zero_at_zero_set_point_after_runaway():
     world = World().run(2.0)
-    change(velocity=lambda v: -v)(world)
+    change_feedback(velocity=lambda v: -v)(world)
     world.until(lambda: world.wheel.recovery.fault is not None, 0.5)
     world.setpoint = 0.0
     found = len(world.log)
@@ -108,7 +108,7 @@ def test_nothing_is_driven_at_a_zero_set_point_after_a_runaway():
     assert all(voltage == 0.0 for _, voltage, _ in world.log[found:])
 
 
-def test_wheel_that_stands_after_a_fault_shows_that_it_hears_its_set_point():
+def test_wheel_at_rest_after_fault_reports_zero_output_and_target():
     world = World().run(2.0)
     world.blocked = True
     world.until(lambda: world.wheel.recovery.fault is not None, 1.5)
@@ -122,7 +122,7 @@ def test_wheel_that_stands_after_a_fault_shows_that_it_hears_its_set_point():
     world.until(lambda: abs(world.speed - 1.5) < 0.15, 4.0)
 
 
-def test_intact_wheel_may_be_tried_as_often_as_it_was_proven_sound():
+def test_retry_count_resets_after_sound_driving():
     world = World().run(2.0)
     for _ in range(6):
         world.blocked = True
@@ -144,7 +144,7 @@ def test_non_finite_set_points_do_not_reset_the_time_out():
     assert world.wheel.refused["set-point that is not a number or implausible"] == 400
 
 
-def test_parameters_that_cannot_be_computed_stop_the_wheel_and_nothing_else(monkeypatch):
+def test_computation_error_stops_the_wheel_and_new_settings_clear_it(monkeypatch):
     world = World().run(1.0)
 
     def fails(*_: object) -> None:
@@ -158,7 +158,7 @@ def test_parameters_that_cannot_be_computed_stop_the_wheel_and_nothing_else(monk
     world.until(lambda: abs(world.speed - 1.5) < 0.15, 5.0)
 
 
-def test_supply_limits_the_voltage_and_hardware_without_one_is_refused():
+def test_supply_limits_voltage_and_invalid_hardware_is_refused():
     world = World(replace(SETTINGS, loop=LoopSettings(gains=replace(GAINS, p=100.0))))
     world.wheel.set_hardware(Gearbox(65.5), Encoder(), 5.0)
     world.run(1.0)

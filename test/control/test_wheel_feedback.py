@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Travel from lost, late, wrong and unequal samples of wheels."""
+"""Wheel travel from lost, late, invalid and unequally timed samples."""
 
 import math
 
@@ -19,7 +19,7 @@ def feed(feedback, t, wheels, position, velocity=0.0, now=None):
         feedback.receive(wheel, WheelSample(t, position, velocity), t if now is None else now)
 
 
-def test_wheels_that_report_at_different_instants_count_once():
+def test_travel_is_counted_once_when_wheels_report_at_different_times():
     feedback = make()
     feed(feedback, 0.0, "abcd", 0.0)
     feedback.take(0.0, TIMEOUT)
@@ -38,7 +38,7 @@ def test_first_reading_adds_no_motion():
     assert feedback.take(0.0, TIMEOUT) is None
 
 
-def test_wheel_that_falls_silent_leaves_the_mean_and_comes_back_without_a_jump():
+def test_silent_wheel_is_excluded_from_mean_and_rejoins_without_jump():
     feedback, total = make(), 0.0
     for k in range(100):
         feed(feedback, 0.1 * k, "acd", 0.1 * k)
@@ -51,7 +51,7 @@ def test_wheel_that_falls_silent_leaves_the_mean_and_comes_back_without_a_jump()
     assert feedback.silent(9.9, TIMEOUT) == {} and total == pytest.approx(9.9)
 
 
-def test_silence_of_a_whole_side_is_told_and_not_guessed():
+def test_silence_of_a_whole_side_is_reported_without_travel():
     feedback = make()
     feed(feedback, 0.0, "abcd", 0.0)
     feedback.take(0.0, TIMEOUT)
@@ -78,7 +78,7 @@ def test_impossible_sample_adds_no_motion(stamp, position):
     assert feedback.take(0.04, TIMEOUT) is not None
 
 
-def test_velocity_stands_in_for_a_position_that_is_nan():
+def test_velocity_replaces_nan_position():
     feedback = make()
     feed(feedback, 0.0, "abcd", math.nan, 2.0)
     feedback.take(0.0, TIMEOUT)
@@ -87,7 +87,7 @@ def test_velocity_stands_in_for_a_position_that_is_nan():
 
 
 @pytest.mark.parametrize("stall", [0.1, 0.12, 0.5, 1.0])
-def test_speed_over_a_stall_is_the_travel_over_the_time_it_was_travelled_in(stall):
+def test_speed_after_stall_is_travel_over_elapsed_stamp_time(stall):
     feedback = make()
     stamps = [0.005 * k for k in range(100)]
     stamps += [0.5 + stall + 0.005 * k for k in range(100)]
@@ -110,15 +110,15 @@ def test_non_finite_sample_does_not_reset_the_time_out():
     assert set(feedback.silent(1.0, TIMEOUT)) == {"a", "b", "c", "d"}
 
 
-RATE, MOST = 200, 11.6
-"""Samples a second, and the fastest that a wheel is believed to turn [rad/s]."""
+RATE, MAX_SPEED = 200, 11.6
+"""Sample rate [Hz] and maximum plausible wheel speed [rad/s]."""
 
 
 def drive(
     see, seconds=6.0, ways=lambda wheel, t: (1.0 if wheel in "ab" else 2.0) * t, wheels=("ab", "cd")
 ):
-    """Drive 2 s on after ``seconds`` with a fault; return the ways of the sides [rad]."""
-    feedback = WheelFeedback(*wheels, max_speed=MOST)
+    """Drive ``seconds`` with a fault, then 2 s without; return both sides' travel [rad]."""
+    feedback = WheelFeedback(*wheels, max_speed=MAX_SPEED)
     left = right = 0.0
     for k in range(round((seconds + 2.0) * RATE) + 1):
         t = k / RATE
@@ -137,7 +137,7 @@ def drive(
 @pytest.mark.parametrize("silence", [0.3, 0.8, 4.0])
 @pytest.mark.parametrize("silent", ["a", "ab", "abcd", "ac"])
 @pytest.mark.parametrize("wheels", [("ab", "cd"), ("a", "c")])
-def test_positions_tell_the_way_of_a_silence(silence, silent, wheels):
+def test_travel_during_silence_is_recovered_from_positions(silence, silent, wheels):
     def see(wheel: str, t: float, sample: WheelSample) -> WheelSample | None:
         return None if wheel in silent and 1.0 < t < 1.0 + silence else sample
 
@@ -146,18 +146,18 @@ def test_positions_tell_the_way_of_a_silence(silence, silent, wheels):
     assert not feedback.problems
 
 
-def test_a_wheel_that_is_silent_for_ever_is_taken_to_turn_as_its_side_does():
+def test_permanently_silent_wheel_is_assumed_to_turn_with_its_side():
     left, right, _ = drive(lambda wheel, t, s: None if wheel == "a" else s, seconds=6.0)
     assert (left, right) == pytest.approx((8.0, 16.0), abs=0.01)
 
 
 def shifted(when, by):
-    """Return a fault that moves positions at some instants."""
+    """Return a fault that offsets positions at selected times."""
     return lambda w, t, s: s._replace(position=s.position + by) if when(w, t) else s
 
 
 @pytest.mark.parametrize("spike", [3.0, -50.0, 1e9, -1e300, math.nan])
-def test_position_spikes_cost_no_way(spike):
+def test_position_spikes_do_not_change_travel(spike):
     see = shifted(lambda wheel, t: wheel == "a" and round(t * RATE) % 50 == 17, spike)
     left, right, feedback = drive(see)
     # A non-finite position is bridged by the velocity, and the next one corrects the sum.
@@ -165,14 +165,14 @@ def test_position_spikes_cost_no_way(spike):
     assert not feedback.problems
 
 
-def test_a_counter_that_is_reset_costs_less_than_a_sample():
+def test_counter_reset_loses_less_than_one_sample_of_travel():
     left, right, feedback = drive(shifted(lambda w, t: w == "a" and t > 3.0, -40.0), seconds=8.0)
     assert (left, right) == pytest.approx((10.0, 20.0), abs=0.01)
     assert "position jumped" in feedback.problems["a"]
 
 
-def test_a_publisher_that_restarted_counts_from_elsewhere():
-    feedback = WheelFeedback(("a",), ("c",), max_speed=MOST)
+def test_travel_continues_from_new_position_of_restarted_publisher():
+    feedback = WheelFeedback(("a",), ("c",), max_speed=MAX_SPEED)
     for t, position, restarted in ((0.0, 100.0, False), (0.1, 100.2, False), (30.0, 0.0, True),
                                    (30.1, 0.3, False)):  # fmt: skip
         for wheel in "ac":
@@ -183,12 +183,12 @@ def test_a_publisher_that_restarted_counts_from_elsewhere():
 
 @pytest.mark.parametrize("lowest", [0.0, -math.pi])
 @pytest.mark.parametrize("speed", [1.0, -5.0])
-def test_a_position_that_wraps_is_named_and_costs_nothing(lowest, speed):
+def test_wrapping_position_is_reported_and_loses_no_travel(lowest, speed):
     def see(wheel: str, t: float, sample: WheelSample) -> WheelSample:
         return sample._replace(position=(sample.position - lowest) % (2 * math.pi) + lowest)
 
     left, right, feedback = drive(see, seconds=8.0, ways=lambda wheel, t: speed * min(t, 7.9))
-    # The last way, back to the true position, is a jump of whole turns.
+    # The last step, back to the true position, is a jump of whole turns.
     assert (left, right) == pytest.approx((7.9 * speed, 7.9 * speed), abs=0.05)
     assert "position wraps" in feedback.problems["a"]
 
@@ -197,13 +197,13 @@ def ahead(wheel: str, t: float) -> float:
     return 2.0 * min(t, 7.9)
 
 
-def test_a_position_that_wraps_elsewhere_costs_no_more_than_the_velocity_tells():
+def test_position_wrap_at_unusual_range_is_bridged_by_velocity():
     left, right, feedback = drive(lambda w, t, s: s._replace(position=s.position % 3.7), 8.0, ahead)
     assert (left, right) == pytest.approx((15.8, 15.8), abs=0.05)
     assert "position jumped" in feedback.problems["c"]
 
 
-def test_a_position_that_is_never_filled_is_named_and_the_velocity_tells_the_way():
+def test_constant_position_is_reported_and_replaced_by_velocity():
     def see(wheel: str, t: float, sample: WheelSample) -> WheelSample:
         return sample._replace(position=0.0)
 
@@ -233,6 +233,6 @@ def test_late_and_repeated_samples_neither_add_nor_lose_motion():
     assert not feedback.problems
 
 
-def test_a_clock_that_is_set_back_costs_one_sample():
+def test_backward_clock_jump_loses_one_sample_of_travel():
     left, right, _ = drive(lambda w, t, s: s._replace(stamp=s.stamp - 3600.0 * (t > 3.0)), 8.0)
     assert (left, right) == pytest.approx((10.0, 20.0), abs=0.05)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The limits of a wheel's controller to the sample; steps of 1/64 s, so that times are exact."""
+"""Limits of the wheel controller, exact to the sample; steps of 1/64 s make times exact."""
 
 import math
 from dataclasses import replace
@@ -25,7 +25,7 @@ SETTINGS = WheelSettings(
 
 
 class Feed:
-    """Passes samples to a controller, 64 a second; the voltage is left to the test."""
+    """Passes 64 samples per second to a controller; the test sets the voltage."""
 
     def __init__(self, settings: WheelSettings = SETTINGS, active: bool = True) -> None:
         self.wheel, self.now = WheelController(settings), 100.0
@@ -44,21 +44,21 @@ class Feed:
         self.wheel.take_setpoint(value, self.now, age)
 
     def hold(self, value: float, velocity: float, samples: int) -> Fault | None:
-        """Ask before every sample; return the fault at the end."""
+        """Send the set-point before every sample; return the fault at the end."""
         for _ in range(samples):
             self.ask(value)
             self.give(velocity)
         return self.wheel.recovery.fault
 
 
-def asked(value: float, settings: WheelSettings = SETTINGS) -> Feed:
-    """Return a wheel with a set-point."""
+def feed_with_setpoint(value: float, settings: WheelSettings = SETTINGS) -> Feed:
+    """Return a feed whose wheel has a set-point."""
     feed = Feed(settings)
     feed.ask(value)
     return feed
 
 
-def test_a_set_point_as_old_as_its_time_out_counts_and_an_older_one_does_not():
+def test_set_point_older_than_time_out_is_refused():
     for age, counts in ((0.5, True), (0.5 + 2.0**-20, False), (-9.0, True)):
         feed = Feed()
         feed.ask(1.0, age)
@@ -68,15 +68,15 @@ def test_a_set_point_as_old_as_its_time_out_counts_and_an_older_one_does_not():
 
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])
-def test_a_set_point_up_to_its_limit_counts(sign):
-    feed = asked(sign * 1.0001e4)
+def test_set_point_above_its_limit_is_refused(sign):
+    feed = feed_with_setpoint(sign * 1.0001e4)
     assert feed.give() == 0.0
     feed.ask(sign * 1e4)
     assert feed.give() == sign * 12.0
 
 
-def test_a_set_point_holds_for_its_time_out_and_then_the_wheel_is_braked():
-    feed = asked(1.0)
+def test_wheel_brakes_after_set_point_time_out():
+    feed = feed_with_setpoint(1.0)
     for k in range(1, 33):  # half a second
         assert feed.give(1.5) == -1.0, k
         assert feed.wheel.state is State.DRIVING
@@ -85,9 +85,9 @@ def test_a_set_point_holds_for_its_time_out_and_then_the_wheel_is_braked():
 
 
 @pytest.mark.parametrize(("transition", "longest"), [(0.0, 1.0), (0.25, 1.0), (60.0, 0.75)])
-def test_a_wheel_that_cannot_be_braked_gets_nothing_after_its_stop_time(transition, longest):
+def test_braking_ends_in_zero_volts_after_stop_time(transition, longest):
     loop = LoopSettings(gains=GAINS, transition_time=transition, stop_time=longest)
-    feed = asked(1.0, replace(SETTINGS, loop=loop))
+    feed = feed_with_setpoint(1.0, replace(SETTINGS, loop=loop))
     start = feed.now
     while (voltage := feed.give(1.5)) != 0.0 or feed.now <= start + 0.5:
         pass
@@ -97,47 +97,49 @@ def test_a_wheel_that_cannot_be_braked_gets_nothing_after_its_stop_time(transiti
 
 
 @pytest.mark.parametrize(("speed", "at_rest"), [(0.049, True), (-0.049, True), (0.05, False)])
-def test_a_wheel_at_rest_needs_no_brake(speed, at_rest):
-    feed = asked(0.0)
+def test_wheel_at_rest_is_not_braked_after_time_out(speed, at_rest):
+    feed = feed_with_setpoint(0.0)
     while feed.wheel.state is not State.TIMED_OUT:
         voltage = feed.give(speed)
     assert (voltage == 0.0) is at_rest
 
 
-def test_a_wheel_that_is_braked_along_its_profile_is_not_let_go_before_its_end():
+def test_braking_profile_is_completed_when_sensor_reports_standstill():
     gains = replace(GAINS, p=1.0, feedforward_velocity=1.0)
-    feed = asked(1.0, replace(SETTINGS, loop=LoopSettings(gains=gains, transition_time=0.5)))
+    feed = feed_with_setpoint(
+        1.0, replace(SETTINGS, loop=LoopSettings(gains=gains, transition_time=0.5))
+    )
     for _ in range(32):
         feed.give(0.0)
-    # The sensor says standstill, the reference is still on its way to zero.
+    # The sensor reports standstill while the reference is still moving to zero.
     assert feed.give(0.0) > 0.5
 
 
-def test_silence_up_to_the_time_out_is_tolerated_and_a_longer_one_is_named():
-    feed = asked(1.0)
+def test_feedback_silence_beyond_time_out_is_reported():
+    feed = feed_with_setpoint(1.0)
     feed.give()
     assert feed.wheel.tick(feed.now + 0.25) is None
     assert feed.wheel.tick(feed.now + 0.25 + DT) == 0.0
     assert feed.wheel.state is State.NO_FEEDBACK
     bad = {"velocity": math.nan}
     for put, state in (({"age": 0.5}, State.LATE_FEEDBACK), (bad, State.BAD_FEEDBACK)):
-        feed = asked(1.0)
+        feed = feed_with_setpoint(1.0)
         feed.give()
         feed.now += 0.5  # so that the late stamps increase
         for _ in range(20):
             feed.give(**put)
             tick = feed.wheel.tick(feed.now)
         assert (tick, feed.wheel.state) == (0.0, state)
-        # When that has ceased as well there is nothing at all.
+        # When these samples cease as well, the state is no feedback.
         assert feed.wheel.tick(feed.now + 0.25) == 0.0 and feed.wheel.state is state
         assert feed.wheel.tick(feed.now + 0.25 + DT) == 0.0
         assert feed.wheel.state is State.NO_FEEDBACK
 
 
-def test_after_silence_the_loop_starts_anew_from_the_speed_that_is():
+def test_loop_restarts_from_measured_speed_after_interruption():
     loop = LoopSettings(gains=replace(GAINS, i=64.0), transition_time=1.0)
     for gap in ("silence", "late", "owner", "bad", "reset"):
-        feed = asked(1.0, replace(SETTINGS, loop=loop))
+        feed = feed_with_setpoint(1.0, replace(SETTINGS, loop=loop))
         feed.hold(1.0, 0.0, 16)
         assert feed.wheel.loop.pid.i_term > 0.5
         if gap == "silence":
@@ -164,16 +166,16 @@ def test_after_silence_the_loop_starts_anew_from_the_speed_that_is():
         assert abs(feed.wheel.loop.pid.i_term) < 0.1
 
 
-def test_speeds_up_to_the_implausible_count_in_both_directions():
+def test_speed_above_implausible_velocity_is_rejected_in_both_directions():
     for sign in (1.0, -1.0):
-        feed = asked(0.0)
+        feed = feed_with_setpoint(0.0)
         assert feed.give(sign * 100.0) == -sign * 12.0
         assert feed.give(sign * 100.01) is None
         assert feed.wheel.refused == {"feedback velocity that is not a number or implausible": 1}
 
 
-def counted() -> Feed:
-    """Return a wheel at a set-point of zero whose speed is a difference of counts."""
+def feed_with_counts() -> Feed:
+    """Return a feed at a set-point of zero whose wheel differences counts."""
     loop = LoopSettings(gains=GAINS, speed_source="difference", difference_window=1)
     feed = Feed(replace(SETTINGS, loop=loop))
     feed.wheel.set_hardware(Gearbox(1.0), Encoder(64.0), 12.0)
@@ -181,8 +183,8 @@ def counted() -> Feed:
     return feed
 
 
-def test_a_count_that_jumps_is_left_out_and_the_speed_begins_anew():
-    feed = counted()
+def test_count_jump_is_rejected_and_differencing_restarts():
+    feed = feed_with_counts()
     per_count = 2.0 * math.pi  # rad/s of one count a sample
     feed.give(encoder_count=0)
     assert feed.give(encoder_count=1) == pytest.approx(-12.0)
@@ -197,8 +199,8 @@ def test_a_count_that_jumps_is_left_out_and_the_speed_begins_anew():
     assert feed.wheel.state is State.BAD_FEEDBACK
 
 
-def test_a_clock_that_jumps_begins_the_counted_speed_anew():
-    feed = counted()
+def test_clock_jump_restarts_differencing_of_counts():
+    feed = feed_with_counts()
     feed.give(encoder_count=0)
     assert feed.give(encoder_count=0) == 0.0
     feed.give(encoder_count=1, age=60.0)
@@ -206,8 +208,8 @@ def test_a_clock_that_jumps_begins_the_counted_speed_anew():
     assert feed.give(encoder_count=1, age=60.0) == 0.0
 
 
-def test_a_wheel_at_fault_answers_every_sample_with_zero():
-    feed = asked(1.0)
+def test_faulted_wheel_answers_every_sample_with_zero_volts():
+    feed = feed_with_setpoint(1.0)
     assert feed.give() == 2.0
     feed.wheel.recovery.set(Fault.RUNAWAY, feed.now)
     for _ in range(32):
@@ -216,7 +218,7 @@ def test_a_wheel_at_fault_answers_every_sample_with_zero():
         assert feed.wheel.state is State.FAULT
 
 
-def test_a_non_finite_voltage_is_replaced_by_the_command():
+def test_non_finite_reported_voltage_is_replaced_by_last_command():
     feed = Feed()
     seen: list[float] = []
     feed.wheel.loop.speed = lambda dt, velocity, count, voltage: seen.append(voltage) or velocity
@@ -227,18 +229,18 @@ def test_a_non_finite_voltage_is_replaced_by_the_command():
     assert seen == [7.0, 2.0, 1.0, -3.0]
 
 
-def test_of_a_gap_between_samples_no_more_than_a_tenth_of_a_second_is_evidence():
+def test_gap_between_samples_counts_at_most_0_1_s_towards_a_fault():
     limits = replace(NO_FAULTS, stall_time=0.5, stall_voltage=4.0)
     feed, found = Feed(replace(SETTINGS, faults=limits)), []
     for _ in range(12):
         feed.ask(6.0)
         feed.give(0.0, dt=0.1875)
         found.append(feed.wheel.recovery.fault)
-    # The first answer has nothing to judge; five tenths of a second of the samples after it.
+    # The first answer counts nothing; then each sample counts 0.1 s towards 0.5 s.
     assert found.index(Fault.NO_MOTION) == 5
 
 
-def test_the_stall_voltage_is_the_one_that_is_set():
+def test_stall_voltage_setting_is_applied():
     gains = replace(GAINS, p=1.0, u_clamp_min=-3.0, u_clamp_max=3.0)
     for stall_voltage, named in ((2.0, Fault.NO_MOTION), (4.0, None)):
         limits = replace(NO_FAULTS, stall_time=0.25, stall_voltage=stall_voltage)
@@ -249,7 +251,7 @@ def test_the_stall_voltage_is_the_one_that_is_set():
     assert changed.hold(5.0, 0.0, 32) is Fault.NO_MOTION
 
 
-def test_an_inactive_wheel_answers_nothing_and_a_reset_forgets_its_set_point():
+def test_inactive_wheel_gives_no_answer_and_reset_clears_set_point():
     feed = Feed(active=False)
     feed.ask(1.0)
     assert feed.give() is None and feed.wheel.tick(feed.now + 9.0) is None
@@ -270,8 +272,8 @@ def test_an_inactive_wheel_answers_nothing_and_a_reset_forgets_its_set_point():
     assert (feed.wheel.output, feed.wheel.answer, feed.wheel.active) == (0.0, None, False)
 
 
-def test_the_terms_of_an_output_are_reported():
-    feed = asked(1.0)
+def test_terms_of_output_are_reported():
+    feed = feed_with_setpoint(1.0)
     assert feed.give(0.25) == 1.5
     wheel = feed.wheel
     assert (wheel.target, wheel.measurement, wheel.output, wheel.steps) == (1.0, 0.25, 1.5, 1)
@@ -281,7 +283,7 @@ def test_the_terms_of_an_output_are_reported():
 
 
 @pytest.mark.parametrize("supply", [0.0, -12.0, math.nan, math.inf])
-def test_an_invalid_supply_is_refused_and_the_old_one_stays(supply):
+def test_invalid_supply_is_refused_and_old_supply_kept(supply):
     feed = Feed()
     feed.wheel.set_hardware(Gearbox(1.0), Encoder(), 5.0)
     with pytest.raises(ValueError, match="supply_voltage"):
@@ -299,7 +301,7 @@ def test_an_invalid_supply_is_refused_and_the_old_one_stays(supply):
     assert (clamp_to_supply.u_clamp_min, clamp_to_supply.u_clamp_max) == (-12.0, 12.0)
 
 
-def test_a_change_is_judged_where_it_is_one_of_the_loop():
+def test_only_changed_loop_settings_are_checked():
     bad = replace(SETTINGS, loop=LoopSettings(gains=replace(GAINS, i=-1.0)))
     with pytest.raises(ValueError, match="i is -1"):
         WheelController(SETTINGS).check(bad)
@@ -309,7 +311,7 @@ def test_a_change_is_judged_where_it_is_one_of_the_loop():
         given.check(replace(bad, loop=LoopSettings(gains=replace(GAINS, i=-2.0))))
 
 
-def test_the_speed_expected_at_a_voltage_follows_from_the_feed_forward():
+def test_expected_speed_in_saturation_follows_from_feed_forward():
     # (12 - 0.5)/2 = 5.75 rad/s; the tolerated error is 2.875 + 0.3.
     gains = replace(GAINS, p=9.0, feedforward_velocity=2.0, feedforward_static=0.5)
     follow = replace(NO_FAULTS, tracking_time=0.75)
@@ -321,7 +323,7 @@ def test_the_speed_expected_at_a_voltage_follows_from_the_feed_forward():
             assert feed.hold(10.0, speed, 64) is fault
 
 
-def test_new_parameters_clear_a_computation_fault_and_no_other():
+def test_new_parameters_clear_only_a_computation_fault():
     for fault in Fault:
         feed = Feed()
         feed.wheel.recovery.set(fault, feed.now)
@@ -330,7 +332,7 @@ def test_new_parameters_clear_a_computation_fault_and_no_other():
     assert WheelController(replace(SETTINGS, fault_retry=7.0)).recovery.first_pause == 7.0
 
 
-def test_hardware_that_does_not_suit_the_clamps_changes_nothing():
+def test_hardware_incompatible_with_clamps_is_refused_without_effect():
     gains = replace(GAINS, u_clamp_min=6.0, u_clamp_max=8.0)
     wheel = WheelController(replace(SETTINGS, loop=LoopSettings(gains=gains)))
     with pytest.raises(ValueError, match="clamp"):
@@ -339,8 +341,8 @@ def test_hardware_that_does_not_suit_the_clamps_changes_nothing():
     assert WheelController(SETTINGS).advice == "" and WheelController(SETTINGS).output == 0.0
 
 
-def test_advice_is_given_once_the_rate_is_known_and_taken_back_with_new_gains():
-    # At 1/64 s, one sample late and averaged over one, a first-order motor takes no such p.
+def test_advice_appears_with_known_rate_and_ends_with_new_gains():
+    # At 1/64 s, with a sample of delay and of averaging, this p is unstable.
     model = MotorModel(dc_gain=1.0, time_constant=0.05)
     rough = replace(SETTINGS, loop=LoopSettings(gains=replace(GAINS, p=50.0), model=model))
     feed = Feed(rough)
@@ -354,7 +356,7 @@ def test_advice_is_given_once_the_rate_is_known_and_taken_back_with_new_gains():
     assert feed.wheel.advice == ""
 
 
-def test_a_fault_of_the_arithmetic_is_counted_held_and_silent_where_the_wheel_is_not_active():
+def test_computation_error_is_counted_and_is_a_fault_only_while_active():
     for active in (True, False):
         feed = Feed(active=active)
         feed.wheel.loop.speed = lambda *_: 1 // 0
@@ -362,7 +364,7 @@ def test_a_fault_of_the_arithmetic_is_counted_held_and_silent_where_the_wheel_is
         assert feed.give() == (0.0 if active else None)
         assert feed.wheel.refused == {"computation: ZeroDivisionError": 1}
         assert (feed.wheel.recovery.fault is Fault.COMPUTATION) is active
-    feed = asked(1.0)
+    feed = feed_with_setpoint(1.0)
     out = feed.wheel.loop.step(1.0, 0.0, DT)._replace(output=math.nan)
     feed.wheel.loop.step = lambda *_: out
     assert feed.give() == 0.0 and feed.wheel.refused == {"output that is not a number": 1}

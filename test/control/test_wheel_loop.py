@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A wheel's loop: the source of its speed, and the state kept when settings change.
+"""The wheel loop: its speed source, and the state kept when settings change.
 
-Steps of 1/64 s, so that times are exact; the speeds are counted out by the tests.
+Steps of 1/64 s make times exact; the tests compute speeds from counts.
 """
 
 import math
@@ -24,8 +24,8 @@ DT, RATIO = 1.0 / 64.0, 2.0
 ENCODER = Encoder(64.0)
 A_COUNT = 2.0 * math.pi / 64.0 / RATIO  # [rad] at the wheel
 MODEL = MotorModel(dc_gain=25.0, time_constant=0.05)
-LEARNT = 20
-"""Samples from which the observer learns the usual interval."""
+LEARNING_SAMPLES = 20
+"""Number of samples from which the observer learns the usual interval."""
 
 
 def make(source: str, **changes: object) -> WheelLoop:
@@ -42,7 +42,7 @@ def rest(loop: WheelLoop, samples: int, voltage: float = 0.0) -> list[str]:
     return sources
 
 
-def test_a_speed_source_needs_its_signals():
+def test_speed_source_requires_its_settings():
     assert LoopSettings().difference_window == 4
     for bad in ({"speed_source": "guess"}, {"difference_window": 0}, {"speed_source": "observer"}):
         with pytest.raises(ParameterError, match=next(iter(bad))):
@@ -50,20 +50,20 @@ def test_a_speed_source_needs_its_signals():
     LoopSettings(speed_source="observer", model=MODEL, difference_window=1)
 
 
-def test_nothing_is_asked_and_nothing_differenced_before_the_first_sample():
+def test_new_loop_has_zero_reference_and_uses_measured_speed():
     loop = make("observer")
     assert (loop.source, loop.reference) == ("measured", (0.0, 0.0, 0.0))
     unknown = WheelLoop(loop.settings)
     assert unknown.speed(DT, 1.25, 7, 3.0) == 1.25 and unknown.source == "measured"
 
 
-def test_the_speed_that_is_reported_is_passed_on_whatever_the_counts_say():
+def test_measured_speed_source_ignores_counts():
     loop = make("measured")
     assert [loop.speed(DT, 1.25, count, 3.0) for count in (0, 500, 7)] == [1.25] * 3
     assert loop.source == "measured"
 
 
-def test_counts_are_differenced_over_the_window_in_the_time_that_passed():
+def test_counts_are_differenced_over_the_elapsed_time_of_the_window():
     loop = make("difference")
     assert math.isnan(loop.speed(DT, 9.0, 1000, 0.0)) and loop.source == "difference"
     assert loop.speed(DT, 9.0, 1001, 0.0) == pytest.approx(A_COUNT / DT)
@@ -71,15 +71,15 @@ def test_counts_are_differenced_over_the_window_in_the_time_that_passed():
     assert loop.speed(DT, 9.0, 1005, 0.0) == pytest.approx(4 * A_COUNT / (4 * DT))
     loop.reset_speed()
     assert math.isnan(loop.speed(DT, 9.0, 1005, 0.0))
-    assert rest(make("difference"), 2 * LEARNT) == ["difference"] * 2 * LEARNT
+    assert rest(make("difference"), 2 * LEARNING_SAMPLES) == ["difference"] * 2 * LEARNING_SAMPLES
 
 
-def test_the_observer_takes_over_once_it_knows_the_usual_interval(monkeypatch):
+def test_observer_starts_once_median_interval_is_known(monkeypatch):
     calls: list[tuple[object, ...]] = []
     real = loops.SpeedObserver
     monkeypatch.setattr(loops, "SpeedObserver", lambda *given: calls.append(given) or real(*given))
     loop = make("observer")
-    for k in range(LEARNT):  # nine of them shorter: the median is the longer
+    for k in range(LEARNING_SAMPLES):  # nine of them shorter: the median is the longer
         loop.speed(DT if k < 9 else 2 * DT, 9.0, 0, 0.0)
         assert loop.source == "difference"
     assert calls == [(MODEL, 2 * DT, ENCODER, ObserverNoise(), 2, 1.0)]
@@ -89,12 +89,12 @@ def test_the_observer_takes_over_once_it_knows_the_usual_interval(monkeypatch):
     assert loop.speed(DT, 9.0, 500, 0.0) == 0.0 and loop.source == "observer"
 
 
-def test_an_observer_that_the_counts_contradict_gives_way_to_them():
+def test_untrusted_observer_is_replaced_by_differenced_counts():
     loop = make("observer")
-    sources = rest(loop, LEARNT + 64, voltage=12.0)  # blocked: more load than 1 V
+    sources = rest(loop, LEARNING_SAMPLES + 64, voltage=12.0)  # blocked: more load than 1 V
     assert sources[-1] == "difference (observer not trusted)"
     assert loop.speed(DT, 9.0, 0, 12.0) == 0.0
-    # Another source of speed has no observer to give way, and the gains that are given.
+    # Another speed source has no observer and uses the given gains unchanged.
     gains = PidGains(p=3.0, i=20.0)
     loop.configure(replace(loop.settings, gains=gains, speed_source="measured", model=None))
     assert rest(loop, 1) == ["measured"] and loop.pid.gains == gains
@@ -111,16 +111,16 @@ def test_an_observer_that_the_counts_contradict_gives_way_to_them():
         ({"speed_source": "measured"}, "measured"),
     ],
 )
-def test_the_speed_source_restarts_when_its_settings_change(change, anew):
+def test_speed_source_restarts_when_its_settings_change(change, anew):
     loop = make("observer")
-    rest(loop, LEARNT + 1)
+    rest(loop, LEARNING_SAMPLES + 1)
     loop.configure(replace(loop.settings, **change))
     assert rest(loop, 1) == [anew]
     if anew == "difference":  # and is learnt from as many samples as at the start
-        assert rest(loop, LEARNT)[-2:] == ["difference", "observer"]
+        assert rest(loop, LEARNING_SAMPLES)[-2:] == ["difference", "observer"]
 
 
-def test_new_limits_of_the_reference_hold_from_the_next_set_point():
+def test_new_reference_limits_apply_from_next_set_point():
     slow, quick = (LoopSettings(limits=ProfileLimits(acceleration=a)) for a in (1.0, 4.0))
     changed, made = WheelLoop(slow), WheelLoop(quick)
     changed.configure(quick)
@@ -132,7 +132,7 @@ def test_new_limits_of_the_reference_hold_from_the_next_set_point():
     assert changed.reference == made.reference and made.reference.velocity == pytest.approx(1.0)
 
 
-def test_a_delayed_reference_is_the_one_of_that_long_ago():
+def test_reference_delay_shifts_the_reference_in_time():
     seen = []
     for samples in (2, 6):
         limits = ProfileLimits(acceleration=1.0)
@@ -148,8 +148,8 @@ def test_a_delayed_reference_is_the_one_of_that_long_ago():
 
 
 @pytest.mark.parametrize(("target", "rest"), [(1.7323209436980074, 52), (1.931078245306091, 54)])
-def test_friction_is_fed_forward_up_to_the_end_of_a_change(target, rest):
-    """Its rate ends in a rounding error, here below zero: no turn back."""
+def test_friction_feed_forward_keeps_its_sign_until_transition_ends(target, rest):
+    """At the end the reference's rate is a rounding error below zero, which is no reversal."""
     gains = PidGains(
         p=0.0, feedforward_static=0.5, feedforward_acceleration=1e-6, u_clamp_min=-9.0,
         u_clamp_max=9.0,
@@ -158,11 +158,11 @@ def test_friction_is_fed_forward_up_to_the_end_of_a_change(target, rest):
     loop.start(0.0)
     volts = [loop.step(target * (k >= rest), 0.0, 0.01).output for k in range(rest + 20)]
     assert volts[:rest] == pytest.approx([0.0] * rest)
-    # A change takes some 10 uV for its acceleration.
+    # The acceleration feed-forward of the transition is some 10 uV.
     assert volts[rest + 2 :] == pytest.approx([0.5] * 18, abs=1e-4)
 
 
-def test_switching_the_delay_on_begins_its_past_at_the_present_reference():
+def test_reference_delay_change_starts_from_present_reference():
     for before, after in ((0.0, 8 * DT), (8 * DT, 0.0), (8 * DT, 4 * DT)):
         limits = ProfileLimits(acceleration=1.0)
         loop = WheelLoop(LoopSettings(limits=limits, reference_delay=before))
@@ -176,10 +176,12 @@ def test_switching_the_delay_on_begins_its_past_at_the_present_reference():
         assert abs(loop.reference.velocity - then) <= 6 * DT
 
 
-def clipped(clip: float, samples: int = 1500) -> tuple[list[float], list[float], list[str]]:
-    """Return speeds, voltages and sources of a wheel that goes to 0.7 rad/s behind a clip [V].
+def simulate_clipped_wheel(
+    clip: float, samples: int = 1500
+) -> tuple[list[float], list[float], list[str]]:
+    """Return speeds, voltages and sources of a step to 0.7 rad/s under clipped voltage [V].
 
-    The gains are the largest for the observer at 5 kHz; the clip is unknown to it.
+    The gains are the largest for the observer at 5 kHz, which does not know the clip.
     """
     ratio, dt = 65.0, 2e-4
     model = MotorModel(dc_gain=2.4, time_constant=0.032, time_constant_product=8.7e-5)
@@ -199,7 +201,7 @@ def clipped(clip: float, samples: int = 1500) -> tuple[list[float], list[float],
     for k in range(samples):
         measured = loop.speed(dt, 0.0, math.floor(angle * 2000.0 / math.tau), voltages[-2])
         if measured == measured:
-            command = loop.step(0.7 if k >= 2 * LEARNT else 0.0, measured, dt).output
+            command = loop.step(0.7 if k >= 2 * LEARNING_SAMPLES else 0.0, measured, dt).output
         voltages.append(command)
         drive = min(max(voltages[-2], -clip), clip)
         angle += float(held.angle_transition[0] @ state + held.angle_forced[0] * drive)
@@ -210,9 +212,9 @@ def clipped(clip: float, samples: int = 1500) -> tuple[list[float], list[float],
 
 
 @pytest.mark.parametrize("clip", [48.0, 21.0, 19.2])  # 18.96 V are 0.7 rad/s
-def test_a_wheel_whose_observer_is_contradicted_stays_calm_and_reaches_its_speed(clip):
-    speeds, voltages, sources = clipped(clip)
+def test_wheel_reaches_its_speed_without_oscillation_under_unknown_voltage_clip(clip):
+    speeds, voltages, sources = simulate_clipped_wheel(clip)
     assert ("difference (observer not trusted)" in sources) == (clip < 48.0)
     assert speeds[-500:] == pytest.approx([0.7] * 500, rel=0.02)
-    assert np.ptp(voltages[-500:]) < 0.2 * 48.0  # not all of both, to and fro
+    assert np.ptp(voltages[-500:]) < 0.2 * 48.0  # no bang-bang oscillation between both limits
     assert max(speeds) < 1.1 * 0.7

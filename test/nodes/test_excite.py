@@ -4,7 +4,7 @@
 import signal
 
 
-def test_excite_is_bounded_ends_by_itself_and_ends_at_zero(process, robot, eventually):
+def test_excite_stays_within_amplitude_and_ends_at_zero_volts(process, robot, eventually):
     process("motor_plant", "--ros-args", "-p", "rate:=100.0")
     eventually(lambda: robot.states["front_left"], 20.0, robot.spin)
     excite = process(
@@ -17,7 +17,7 @@ def test_excite_is_bounded_ends_by_itself_and_ends_at_zero(process, robot, event
         last = robot.commands[wheel]
         eventually(lambda c=last: c[-1].voltage == 0.0, 3.0, robot.spin, "no zero command")
     one, two = ([m.voltage for m in robot.commands[w]] for w in ("front_left", "rear_right"))
-    # 500 are sent; discovery may take seconds of them, and a busy machine skips some.
+    # 500 are sent; discovery may take seconds, and a busy machine skips some.
     assert len(one) > 60 and max(map(abs, one)) <= 5.0 and max(map(abs, one)) > 2.0
     assert one[20:60] != two[20:60]
     assert not robot.commands["front_right"]
@@ -32,7 +32,7 @@ def test_excite_is_bounded_ends_by_itself_and_ends_at_zero(process, robot, event
         eventually(lambda c=last: c[-1].voltage == 0.0, 3.0, robot.spin, "no zero command")
 
 
-def test_excite_leaves_a_wheel_that_another_drives_alone(process, robot, eventually):
+def test_excite_refuses_a_wheel_driven_by_another_node(process, robot, eventually):
     process("motor_plant", "--ros-args", "-p", "rate:=100.0")
     process("wheel_pid", "--ros-args", "-r", "__ns:=/front_left", "-p", "p:=5.0")
     robot.setpoint = 1.0
@@ -47,7 +47,7 @@ def test_excite_leaves_a_wheel_that_another_drives_alone(process, robot, eventua
     assert excite.returncode == 0, "a controller at rest does not hold its wheel"
 
 
-def test_a_wheel_that_is_too_fast_or_is_not_heard_ends_the_signal(process, robot, eventually):
+def test_excite_ends_on_overspeed_or_missing_feedback(process, robot, eventually):
     plant = process("motor_plant", "--ros-args", "-p", "rate:=100.0")
     eventually(lambda: robot.states["rear_left"], 20.0, robot.spin)
     square = ("excite", "--ros-args", "-p", "signal:=square")
@@ -58,7 +58,7 @@ def test_a_wheel_that_is_too_fast_or_is_not_heard_ends_the_signal(process, robot
     eventually(lambda: not last or last[-1].voltage == 0.0, 3.0, robot.spin, "no zero command")
     last.clear()
     excite = process(*square, "-p", "wheels:=[rear_left]", "-p", "duration:=60.0")
-    # Two seconds, in which it has heard the wheel, too; it would go on for longer than that waits.
+    # Within these two seconds it has received feedback; the signal itself lasts longer.
     eventually(lambda: len(last) > 200, 20.0, robot.spin, excite.output)
     plant.send_signal(signal.SIGKILL)
     eventually(lambda: excite.returncode is not None, 20.0, robot.spin, excite.output)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""identifier as its own process, on a plant that others excite."""
+"""identifier as its own process, on a plant that excite drives."""
 
 import math
 import signal
@@ -12,7 +12,7 @@ TRUE_GAIN = 25.548
 """Of motor 1, K / (R b + K^2) of Table 1 [rad/s/V]."""
 
 
-def test_values_appear_after_enough_motion_and_are_right(process, robot, eventually):
+def test_accurate_estimate_is_published_after_sufficient_excitation(process, robot, eventually):
     heard: list[MotorParameters] = []
     latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
     robot.node.create_subscription(

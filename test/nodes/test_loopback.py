@@ -24,7 +24,7 @@ def bound_addresses(pid: int) -> set[str]:
     return found
 
 
-def test_nodes_bind_to_loopback_and_hear_each_other(process, node, eventually):
+def test_nodes_bind_to_loopback_and_discover_each_other(process, node, eventually):
     names = [("motor_plant",), ("skid_steer",), ("record", "--output", "bag")]
     wheels = [("wheel_pid", "--ros-args", "-r", f"__ns:=/front_{s}") for s in ("left", "right")]
     started = [process(*command) for command in (*names, *wheels)]
@@ -34,6 +34,6 @@ def test_nodes_bind_to_loopback_and_hear_each_other(process, node, eventually):
         assert bound_addresses(one.pid) == {"127.0.0.1"}, one.command
 
 
-def test_another_middleware_gets_the_discovery_range_of_ros_only(monkeypatch):
+def test_other_middleware_gets_only_the_ros_discovery_range(monkeypatch):
     monkeypatch.setenv("RMW_IMPLEMENTATION", "rmw_cyclonedds_cpp")
     assert loopback.loopback_environment() == {"ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}

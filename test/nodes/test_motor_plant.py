@@ -15,7 +15,7 @@ from smp_interfaces.msg import MotorCommand, MotorDescription
 PAPER = Path(__file__).parents[2] / "config" / "motors_paper.yaml"
 
 
-def test_plant_turns_on_commands_stops_without_and_describes_itself(process, robot, eventually):
+def test_plant_follows_commands_times_out_and_publishes_description(process, robot, eventually):
     plant = process("motor_plant", "--ros-args", "-p", "rate:=100.0")
     front, idle = robot.states["front_left"], robot.states["rear_right"]
     eventually(lambda: len(front) > 20, 20.0, robot.spin, "no feedback")
@@ -70,7 +70,7 @@ def test_plant_turns_on_commands_stops_without_and_describes_itself(process, rob
     ],
 )
 @pytest.mark.parametrize("way", ["motors_file", "params-file"])
-def test_bad_motor_file_ends_the_plant_with_one_line(process, tmp_path, change, words, way):
+def test_invalid_motor_file_ends_plant_with_one_line(process, tmp_path, change, words, way):
     path = tmp_path / "bad.yaml"
     path.write_text(PAPER.read_text().replace(*change))
     given = ["-p", f"motors_file:={path}"] if way == "motors_file" else ["--params-file", path]
@@ -79,7 +79,7 @@ def test_bad_motor_file_ends_the_plant_with_one_line(process, tmp_path, change, 
     assert words in plant.output and len(plant.output.strip().splitlines()) == 1
 
 
-def test_wheel_obeys_one_writer_until_that_one_rests(process, robot, eventually):
+def test_wheel_obeys_one_writer_until_its_lease_ends(process, robot, eventually):
     process("motor_plant", "--ros-args", "-p", "rate:=100.0")
     front = robot.states["front_left"]
     eventually(lambda: len(front) > 20, 20.0, robot.spin, "no feedback")

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""play as a process: it sends the recorded messages at their times, and nothing else."""
+"""play as a process: it sends exactly the recorded messages, at their times."""
 
 import threading
 import time
@@ -16,8 +16,8 @@ from traffic import RELIABLE, contents, raw, so_far
 
 from smp_motor_ident.bag import BagWriter
 
-# Where the first word of a DDS participant is lost, its next follows after 3 s.
-UNHURRIED = ("--delay", "5")
+# A DDS participant whose first announcement is lost repeats it after 3 s.
+DISCOVERY_DELAY = ("--delay", "5")
 
 
 Process = Callable[..., Any]
@@ -42,7 +42,7 @@ def write_bag(path: Path, count: int = 100, step: int = 10_000_000) -> dict[str,
 
 
 class Listener:
-    """Takes topics raw in a thread of its own, with the time of each message."""
+    """Receives raw topics in its own thread, with the time of each message."""
 
     def __init__(self, node: Node, topics: dict[str, Any]) -> None:
         self.data: dict[str, list[bytes]] = {name: [] for name in topics}
@@ -76,11 +76,11 @@ def listener(node: Node) -> Iterator[Listener]:
     made.close()
 
 
-def test_play_repeats_bytes_and_times(process, listener, eventually, tmp_path):
+def test_play_reproduces_bytes_and_times(process, listener, eventually, tmp_path):
     written = write_bag(tmp_path / "bag")
     recorder = process("record", "-o", tmp_path / "again", "--regex", "/number|/text")
     eventually(lambda: "recording to" in recorder.output, deadline=20.0)
-    player = process("play", tmp_path / "bag", *UNHURRIED)
+    player = process("play", tmp_path / "bag", *DISCOVERY_DELAY)
     assert player.wait(30.0) == 0
     assert listener.data == {**written, "/clock": []}
     times = listener.times["/number"]
@@ -93,10 +93,10 @@ def test_play_repeats_bytes_and_times(process, listener, eventually, tmp_path):
     assert contents(tmp_path / "again") == written
 
 
-def test_play_has_a_rate_an_offset_a_clock_and_topics(process, listener, tmp_path):
+def test_play_supports_rate_offset_clock_and_topics(process, listener, tmp_path):
     written = write_bag(tmp_path / "bag")
     arguments = ("--rate", "0.5", "--start-offset", "0.5", "--clock", "100", "--topics", "number")
-    arguments += UNHURRIED
+    arguments += DISCOVERY_DELAY
     player = process("play", tmp_path / "bag", *arguments)
     assert player.wait(30.0) == 0
     assert listener.data["/number"] == written["/number"][50:]
@@ -109,7 +109,7 @@ def test_play_has_a_rate_an_offset_a_clock_and_topics(process, listener, tmp_pat
 
 def test_play_loops_until_it_is_interrupted(process, listener, eventually, tmp_path):
     written = write_bag(tmp_path / "bag", count=10)
-    player = process("play", tmp_path / "bag", "--loop", "--rate", "2", *UNHURRIED)
+    player = process("play", tmp_path / "bag", "--loop", "--rate", "2", *DISCOVERY_DELAY)
     eventually(lambda: len(listener.data["/number"]) >= 25, deadline=20.0)
     player.interrupt()
     assert player.wait(3.0) == 0
@@ -135,7 +135,7 @@ def test_play_refuses_invalid_arguments_in_one_line(process, tmp_path, arguments
     assert "Traceback" not in player.output
 
 
-def test_play_names_types_that_it_leaves_out(process, listener, eventually, tmp_path):
+def test_play_reports_types_that_it_skips(process, listener, eventually, tmp_path):
     bag = tmp_path / "odd.mcap"
     with bag.open("wb") as file:
         writer = mcap.writer.Writer(file)
@@ -152,7 +152,7 @@ def test_play_names_types_that_it_leaves_out(process, listener, eventually, tmp_
             channel = writer.register_channel(topic, "cdr", schema)
             writer.add_message(channel, stamp, data, stamp)
         writer.finish()
-    player = process("play", bag, *UNHURRIED)
+    player = process("play", bag, *DISCOVERY_DELAY)
     assert player.wait(20.0) == 0
     assert "/odd is not played: its type strange_msgs/msg/Thing is not installed" in player.output
     assert "/number: its messages of type std_msgs/msg/String are not played" in player.output

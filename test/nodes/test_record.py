@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""record as a process: nothing is lost or changed, however it ends."""
+"""record as a process: no message is lost or changed, for any ending."""
 
 import re
 import signal
@@ -52,14 +52,14 @@ def test_no_message_of_four_wheels_at_1_khz_is_lost(node, process, eventually, t
     assert not any("missing" in f.message for f in records["front_left"].findings)
 
 
-def test_best_effort_messages_are_recorded_or_told_as_lost(node, process, eventually, tmp_path):
+def test_best_effort_messages_are_recorded_or_reported_as_lost(node, process, eventually, tmp_path):
     bag = tmp_path / "bag"
     names = [f"/{wheel}/motor_state" for wheel in WHEELS]
     publishers = [node.create_publisher(MotorState, name, BEST_EFFORT) for name in names]
     recorder = process("record", "--output", bag)
     eventually(lambda: all(p.get_subscription_count() for p in publishers), deadline=20.0)
     sent = publish_steadily(publishers, 1000, 250.0)
-    # Nobody acknowledges best effort: it is all there when no more comes.
+    # Best effort has no acknowledgement: the bag is complete when it stops growing.
     seen: list[int] = []
 
     def at_rest() -> bool:
@@ -129,7 +129,7 @@ def test_topics_are_chosen_by_name_and_pattern(node, process, eventually, tmp_pa
     assert set(contents(bag)) == {"/a/x", "/c"}
 
 
-def test_a_bag_is_replaced_only_by_force_and_nothing_else_ever(process, eventually, tmp_path):
+def test_only_a_bag_is_overwritten_and_only_with_force(process, eventually, tmp_path):
     bag, folder = tmp_path / "bag", tmp_path / "folder"
     with BagWriter(bag) as writer:
         writer.write("/old", "std_msgs/msg/Float64", bytes(12), 1)
@@ -153,7 +153,7 @@ def test_a_bag_is_replaced_only_by_force_and_nothing_else_ever(process, eventual
     assert "/old" not in contents(bag)
 
 
-def test_message_of_another_type_than_its_topic_is_not_written(tmp_path):
+def test_message_with_wrong_type_for_its_topic_is_refused(tmp_path):
     with BagWriter(tmp_path / "bag") as bag:
         bag.write("/number", "std_msgs/msg/Float64", raw(Float64(data=4.0)), 1_000)
         with pytest.raises(BagError, match="is of the type std_msgs/msg/Float64, not"):

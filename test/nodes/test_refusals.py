@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A node that is given what it cannot run with says so in one line and ends with code 2."""
+"""A node with invalid settings reports them in one line and exits with code 2."""
 
 import pytest
 
@@ -30,7 +30,7 @@ REFUSED = [
 
 
 @pytest.mark.parametrize(("node", "given", "words"), REFUSED)
-def test_a_node_refuses_what_it_cannot_run_with_in_one_line(process, node, given, words):
+def test_node_refuses_invalid_settings_in_one_line(process, node, given, words):
     started = process(node, "--ros-args", *given.split())
     assert started.wait(20.0) == 2
     (line,) = started.output.strip().splitlines()
@@ -59,6 +59,6 @@ def test_a_node_refuses_what_it_cannot_run_with_in_one_line(process, node, given
         (serial_driver, {"encoder_bits": 1}, "encoder_bits is 1"),
     ],
 )
-def test_settings_that_no_robot_has_are_refused(node, given, words):
+def test_invalid_wheel_names_and_hardware_settings_are_refused(node, given, words):
     with pytest.raises(ParameterError, match=words):
         node.Settings(**given)

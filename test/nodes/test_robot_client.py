@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The client of a running robot against a wheel whose graph becomes known piece by piece."""
+"""The client of a running robot while the ROS graph of a wheel is discovered step by step."""
 
 import threading
 
@@ -13,7 +13,7 @@ from smp_motor_control.nodes.runtime import LATCHED
 
 
 class Wheel:
-    """Diagnostics of a driver on its writer, and the services of that controller."""
+    """A driver that publishes the owner of its wheel, and the services of that controller."""
 
     def __init__(self, node) -> None:
         self.node, self.state = node, "active"
@@ -52,7 +52,7 @@ def wheel(node):
     thread.join()
 
 
-def test_a_controller_that_only_the_driver_names_yet_is_paused_and_activated_again(wheel):
+def test_controller_known_only_to_driver_is_paused_and_reactivated(wheel):
     late = threading.Timer(2.0, wheel.serve)
     late.start()
     with RobotClient(name="tester_of_pause", guarded=False) as client:
@@ -62,7 +62,7 @@ def test_a_controller_that_only_the_driver_names_yet_is_paused_and_activated_aga
     late.join()
 
 
-def test_a_wheel_that_stays_anothers_is_refused_with_its_driver(wheel, monkeypatch):
+def test_pause_of_wheel_owned_by_another_node_is_refused_with_its_name(wheel, monkeypatch):
     monkeypatch.setattr("smp_motor_control.nodes.robot_client.TIMEOUT_S", 3.0)
     wheel.owners.publish(String(data="/teleop#9"))
     with (

@@ -95,7 +95,7 @@ def test_lean_executor_serves_topics_timers_services_clients_and_coroutines(cont
     node.destroy_timer(timer)
 
 
-def test_lean_executor_lives_through_entities_made_and_destroyed_in_callbacks(context, executor):
+def test_lean_executor_survives_entities_created_and_destroyed_in_callbacks(context, executor):
     node = rclpy.create_node("coming_and_going", context=context)
     executor.add_node(node)
     publisher = node.create_publisher(String, "y", STREAM_PUBLISHER)
@@ -156,7 +156,7 @@ def test_waiting_for_a_stream_delays_other_callbacks_only_briefly(context, execu
     begin = time.monotonic()
     for _ in range(20):
         call()
-    assert time.monotonic() - begin < 10.0  # a busy machine's; a fiftieth of it is usual
+    assert time.monotonic() - begin < 10.0  # for a busy machine; usually a fiftieth
 
     refused: list[object] = []
     node.create_subscription(
@@ -169,7 +169,7 @@ def test_waiting_for_a_stream_delays_other_callbacks_only_briefly(context, execu
     call()
 
 
-def test_messages_taken_by_their_owner_wake_no_executor(context, executor):
+def test_polled_subscription_does_not_wake_the_executor(context, executor):
     node = rclpy.create_node("batches", context=context)
     executor.add_node(node)
     kept = node.create_subscription(
@@ -225,7 +225,7 @@ def test_an_event_of_a_destroyed_entity_does_not_end_the_spin(context, executor)
     assert named in (["one"], ["two"])
 
 
-def test_exception_in_a_callback_comes_out_of_the_spin(context, executor):
+def test_exception_in_a_callback_propagates_from_spin(context, executor):
     node = rclpy.create_node("raising", context=context)
     executor.add_node(node)
     steady_timer(node, 0.01, lambda: [][0])
@@ -245,7 +245,7 @@ class Settings:
             raise ParameterError(f"low is {self.low}; it must be below high, {self.high}")
 
 
-def test_settings_change_as_a_whole_or_not_at_all(context):
+def test_settings_change_atomically(context):
     node = rclpy.create_node("settled", context=context)
     changes: list[Settings] = []
     parameters = Parameters(node, Settings, changes.append)
@@ -290,8 +290,8 @@ def test_a_node_that_raises_stops_its_motors_and_reports_the_error(process):
     assert "busy: stopped by ValueError: too bad" in node.output
 
 
-def test_no_lease_of_liveliness_is_offered():
-    # What renews one can lock up with the end of another process, for ever.
+def test_stream_publisher_offers_no_liveliness_lease():
+    # The renewal of a lease can deadlock when another process ends.
     assert (
         STREAM_PUBLISHER.liveliness_lease_duration == QoSProfile(depth=1).liveliness_lease_duration
     )

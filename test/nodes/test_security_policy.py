@@ -46,7 +46,7 @@ NODES: list[tuple[str, Callable[[], Node]]] = [
 ]  # fmt: skip
 
 
-def allowed() -> dict[str, Allowed]:
+def read_policy() -> dict[str, Allowed]:
     """Return the policy's rules: full names by the node's path and by the kind of access."""
     result: dict[str, Allowed] = {}
     for context in POLICY.iter("context"):
@@ -65,7 +65,7 @@ def allowed() -> dict[str, Allowed]:
     return result
 
 
-def used(make: Callable[[], Node], namespace: str, domain: int) -> tuple[str, Allowed]:
+def list_access(make: Callable[[], Node], namespace: str, domain: int) -> tuple[str, Allowed]:
     """Make a node and return its publications, subscriptions and services."""
     rclpy.init(args=["--ros-args", "-r", f"__ns:={namespace}"], domain_id=domain)
     try:
@@ -83,21 +83,21 @@ def used(make: Callable[[], Node], namespace: str, domain: int) -> tuple[str, Al
 
 
 @pytest.mark.parametrize(("namespace", "make"), NODES[3:], ids=lambda x: getattr(x, "__name__", ""))
-def test_the_policy_allows_a_node_the_topics_it_uses(namespace, make, ros_domain, monkeypatch):
+def test_policy_allows_exactly_the_topics_a_node_uses(namespace, make, ros_domain, monkeypatch):
     monkeypatch.setattr(teleop_wheels, "Terminal", Mock())  # tests have no terminal
-    path, access = used(make, namespace, ros_domain)
-    rules = allowed()[path]
+    path, access = list_access(make, namespace, ros_domain)
+    rules = read_policy()[path]
     for kind, names in access.items():
         assert names <= rules[kind], f"{path} may not {kind} {names - rules[kind]}"
-    # And no more, but what rcl adds, or a package that is not installed here would.
+    # No more than these, except the topics of rcl and of packages not installed here.
     always = {"/clock", "/parameter_events", "/rosout", "/tf"}
     for kind in ("publish", "subscribe"):
         spare = {n for n in rules[kind] - access[kind] - always if "transition_event" not in n}
         assert not spare, f"{path} never uses {spare}"
 
 
-def test_the_wheels_may_do_alike_and_few_may_command_them():
-    rules = allowed()
+def test_wheels_have_equal_rights_and_few_nodes_may_command_them():
+    rules = read_policy()
     wheels = [
         {
             k: {n.replace(f"/{w}/", "/wheel/") for n in v}

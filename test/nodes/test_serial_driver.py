@@ -22,7 +22,7 @@ from smp_motor_control.errors import ParameterError
 from smp_motor_control.serial_protocol import LineSplitter, decode_state, encode, encode_voltages
 
 GAIN = 20.0
-"""Of the board's motors [rad/s/V]: they answer at once, so the truth is a product."""
+"""Gain of the board's motors [rad/s/V], which respond without lag."""
 
 COUNTS = 500.0
 PERIOD = 0.01
@@ -116,7 +116,7 @@ def driver(board: Firmware, process: Callable[..., Any]) -> Callable[..., Any]:
     return lambda *more: process("serial_driver", *given, *more)
 
 
-def test_it_drives_through_lost_bytes_resets_and_unplugging(board, node, driver, eventually):
+def test_driver_recovers_from_lost_bytes_resets_and_unplugging(board, node, driver, eventually):
     started = driver("-p", "encoder_bits:=16")
     seen: list[MotorState] = []
     node.create_subscription(MotorState, "left/motor_state", seen.append, 10)
@@ -139,7 +139,7 @@ def test_it_drives_through_lost_bytes_resets_and_unplugging(board, node, driver,
         trouble()
         begun = len(seen)
         eventually(lambda: len(seen) > begun + 30 and turning(), 20.0, drive, started.output)
-        # Whatever was lost, no sample says that the wheel turned otherwise than it did.
+        # No sample reports a speed that the wheel did not have, whatever was lost.
         assert max(abs(m.velocity) for m in seen[begun:]) < 1.5 * 3.0 * GAIN
 
     settles_after(lambda: setattr(board, "loss", 0.01))
@@ -181,7 +181,7 @@ def robot(node: Node) -> Any:
 
 # 36 V in 16 bits are -29536 mV; a divider may show anything.
 @pytest.mark.parametrize("battery", [-12000, -29536, -1, 65535, 10**17, 0, 40, ""])
-def test_no_reported_supply_turns_zero_into_motion(board, robot, driver, eventually, battery):
+def test_zero_command_stays_zero_for_any_reported_supply(board, robot, driver, eventually, battery):
     board.battery = battery
     started = driver()
     eventually(lambda: len(board.obeyed) > 30, 20.0, robot.drive, started.output)
@@ -195,7 +195,7 @@ def test_no_reported_supply_turns_zero_into_motion(board, robot, driver, eventua
     eventually(lambda: any(words in m for m in robot.diagnoses), 5.0, robot.drive, robot.diagnoses)
 
 
-def test_a_suspended_board_gets_few_outdated_commands(board, robot, driver, eventually):
+def test_suspended_board_receives_few_outdated_commands(board, robot, driver, eventually):
     started = driver()
     robot.voltage = 3.0
     eventually(lambda: board.voltages == [3.0, 3.0], 20.0, robot.drive, started.output)
@@ -213,7 +213,7 @@ def test_a_suspended_board_gets_few_outdated_commands(board, robot, driver, even
     assert board.obeyed[stale:] == [[0.0, 0.0]] * (len(board.obeyed) - stale)
 
 
-def test_commands_follow_the_clock_of_their_sample(board, robot, driver, eventually):
+def test_commands_carry_the_clock_of_their_sample(board, robot, driver, eventually):
     told: list[tuple[int, float]] = []
 
     def listen(lines: LineSplitter, now: float) -> None:
@@ -232,7 +232,7 @@ def test_commands_follow_the_clock_of_their_sample(board, robot, driver, eventua
     assert ages[0] > 0.0 and ages[len(ages) // 2] < 0.1
 
 
-def test_lines_that_no_board_sends_end_nothing(board, robot, driver, eventually):
+def test_malformed_lines_do_not_stop_the_driver(board, robot, driver, eventually):
     started = driver()
     eventually(lambda: len(robot.seen) > 5, 20.0, robot.drive, started.output)
     long = "9" * 400
@@ -249,7 +249,7 @@ def test_lines_that_no_board_sends_end_nothing(board, robot, driver, eventually)
     assert started.returncode is None
 
 
-def test_a_device_that_is_not_a_terminal_is_named_and_closed(tmp_path, robot, process, eventually):
+def test_non_terminal_device_is_reported_and_closed(tmp_path, robot, process, eventually):
     (tmp_path / "notes.txt").write_text("no terminal\n")
     started = process("serial_driver", *options(f"device:={tmp_path / 'notes.txt'}"))
     eventually(lambda: robot.diagnoses, 20.0, robot.drive, started.output)
@@ -260,7 +260,7 @@ def test_a_device_that_is_not_a_terminal_is_named_and_closed(tmp_path, robot, pr
     assert open_files() <= before  # six tries later
 
 
-def test_a_device_that_another_program_has_is_left_alone(board, robot, driver, eventually):
+def test_device_opened_by_another_program_is_not_used(board, robot, driver, eventually):
     driver()
     eventually(lambda: len(robot.seen) > 5, 20.0, robot.drive)
     driver("-r", "__ns:=/second")
@@ -270,7 +270,7 @@ def test_a_device_that_another_program_has_is_left_alone(board, robot, driver, e
     )  # fmt: skip
 
 
-def test_a_line_that_was_spoilt_is_never_taken():
+def test_line_with_a_missing_character_is_refused():
     line = encode("S,1000,12000,17,250,-4,").decode().strip()
     assert decode_state(line, 2).counts == (17, -4)
     assert math.isnan(decode_state(line, 2).currents[1])

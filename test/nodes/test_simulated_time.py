@@ -26,7 +26,7 @@ NODES = {
 MISSING = "/clock is not published"
 
 
-def test_every_node_names_a_missing_clock_and_follows_one(process, node, eventually):
+def test_every_node_reports_a_missing_clock_and_follows_a_published_one(process, node, eventually):
     said: dict[str, str] = {}
 
     def listen(message: DiagnosticArray) -> None:
@@ -85,7 +85,7 @@ def stamp(message: MotorState) -> float:
 
 @pytest.mark.parametrize("factor", [0.5, 2.0])
 def test_simulated_motors_move_in_simulated_time(process, node, eventually, factor):
-    """At 1 rad/s of simulated time, whatever passes outside, and without a fault."""
+    """The wheel turns at 1 rad/s of simulated time at any pace, without a fault."""
     states: list[MotorState] = []
     said: dict[str, str] = {}
     node.create_subscription(MotorState, "front_left/motor_state", states.append, 100)
@@ -105,7 +105,7 @@ def test_simulated_motors_move_in_simulated_time(process, node, eventually, fact
     assert (states[-1].position - begun.position) / passed == pytest.approx(1.0, abs=0.02)
     assert said["front_left/wheel_pid"].startswith("driving")
 
-    # A clock that is set back, as by a log that is played once more, is no jump of the motor.
+    # Setting the clock back, as by replaying a log, does not move the motor.
     before, pace.now = len(states), pace.now - 60.0
     last = states[-1].position
     eventually(lambda: len(states) > before + 5, 20.0, pace.step)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""skid_steer as its own process: commands, limits, parameters, leaving."""
+"""skid_steer as its own process: commands, limits, parameters, exit."""
 
 import json
 import math
@@ -21,7 +21,7 @@ BEHAVIOUR = json.loads(
 )["behaviour_cases"]
 
 
-def test_only_a_sound_and_fresh_command_starts_the_wheels(skid_steer, peer, eventually):
+def test_only_finite_and_fresh_commands_start_the_wheels(skid_steer, peer, eventually):
     started = skid_steer()
     eventually(lambda: peer.diagnosis(""), deadline=5.0, step=peer.spin)
     for _ in range(8):
@@ -49,12 +49,12 @@ def test_command_turns_all_four_wheels_and_its_timeout_stops_them(skid_steer, pe
     assert set(peer.speeds()) == set(JOINTS)
     before = len(peer.setpoints)
     for _ in range(10):
-        peer.command(math.nan, math.nan)  # changes nothing, for as long as the last one holds
+        peer.command(math.nan, math.nan)  # changes nothing while the last command is valid
         peer.spin_for(0.02)
     assert len(peer.setpoints) > before
     seen = {value for message in peer.setpoints[before:] for value in message.velocity}
     assert seen == {-2.0, 2.0}
-    # Then cmd_vel_timeout, 0.5 s, from the last sound message on, whatever else comes.
+    # The time-out of 0.5 s counts from the last valid message.
     peer.setpoints.clear()
     sent = time.monotonic()
     peer.command(0.0, 1.0)
@@ -72,7 +72,7 @@ def test_command_turns_all_four_wheels_and_its_timeout_stops_them(skid_steer, pe
     repeatedly(peer, lambda: peer.command(1.0), lambda: peer.drives(10.0, 10.0), eventually, 1.0)
 
 
-def test_an_idle_body_leaves_the_wheels_to_another_node(skid_steer, peer, eventually):
+def test_idle_body_yields_wheels_to_another_node(skid_steer, peer, eventually):
     skid_steer()
     repeatedly(peer, lambda: peer.command(1.0), lambda: peer.drives(10.0, 10.0), eventually)
     eventually(lambda: peer.drives(0.0, 0.0), deadline=3.0, step=peer.spin)
@@ -98,7 +98,7 @@ def test_an_idle_body_leaves_the_wheels_to_another_node(skid_steer, peer, eventu
     eventually(lambda: peer.drives(0.0, 0.0), deadline=3.0, step=peer.spin)
 
 
-def test_plain_and_stamped_twist_are_understood_one_after_the_other(skid_steer, peer, eventually):
+def test_plain_and_stamped_twist_are_accepted_in_turn(skid_steer, peer, eventually):
     skid_steer("-r", "cmd_vel:=cmd_vel_plain", listens="cmd_vel_plain")
     message = Twist()
     message.linear.x = 1.0
@@ -106,13 +106,13 @@ def test_plain_and_stamped_twist_are_understood_one_after_the_other(skid_steer, 
         peer, lambda: peer.plain.publish(message), lambda: peer.drives(10.0, 10.0), eventually
     )
     eventually(lambda: peer.drives(0.0, 0.0), deadline=2.0, step=peer.spin)
-    # The middleware has one type by topic in a process, so the same peer cannot publish both.
+    # A process has one type per topic in the middleware, so one peer cannot publish both.
     peer.node.destroy_publisher(peer.plain)
     peer.stamped = peer.node.create_publisher(TwistStamped, "cmd_vel_plain", 10)
     repeatedly(peer, lambda: peer.command(0.5), lambda: peer.drives(5.0, 5.0), eventually)
 
 
-def test_another_type_that_is_published_too_is_named(skid_steer, peer, process, eventually):
+def test_second_command_type_on_the_topic_is_reported(skid_steer, peer, process, eventually):
     skid_steer()
     program = (
         "import rclpy, time\nfrom geometry_msgs.msg import Twist\nrclpy.init()\n"
@@ -124,7 +124,7 @@ def test_another_type_that_is_published_too_is_named(skid_steer, peer, process, 
     assert peer.drives(5.0, 5.0)
 
 
-def test_silence_brakes_within_the_limits(skid_steer, peer, eventually):
+def test_command_time_out_brakes_within_acceleration_limit(skid_steer, peer, eventually):
     """ros-navigation/navigation2 issue 3481: a time-out that stops at once."""
     skid_steer("-p", "linear.x.max_acceleration:=1.0")
     repeatedly(peer, lambda: peer.command(0.5), lambda: peer.drives(5.0, 5.0), eventually)
@@ -139,7 +139,7 @@ def test_silence_brakes_within_the_limits(skid_steer, peer, eventually):
 @pytest.mark.parametrize(
     "limit", ["linear.x.max_acceleration:=0.01", "linear.x.max_jerk:=0.01", "stop_time:=0.3"]
 )
-def test_a_body_stands_in_its_stop_time_whatever_its_limits(skid_steer, peer, eventually, limit):
+def test_body_stops_within_stop_time_for_any_limits(skid_steer, peer, eventually, limit):
     """A command of 0.5 m/s that it reached without limits, then zero under the limit."""
     skid_steer()
     repeatedly(peer, lambda: peer.command(0.5), lambda: peer.drives(5.0, 5.0), eventually)
@@ -157,7 +157,7 @@ def test_a_body_stands_in_its_stop_time_whatever_its_limits(skid_steer, peer, ev
     assert peer.drives(0.0, 0.0) or name == "stop_time"
 
 
-def test_parameters_change_while_driving_or_are_refused(skid_steer, peer, eventually):
+def test_parameters_change_while_driving_and_invalid_ones_are_refused(skid_steer, peer, eventually):
     skid_steer("-p", "linear.x.max_acceleration:=0.5")
     repeatedly(peer, lambda: peer.command(0.5), lambda: peer.drives(5.0, 5.0), eventually)
     stamps = [m.header.stamp.sec + 1e-9 * m.header.stamp.nanosec for m in peer.setpoints]
@@ -188,8 +188,8 @@ def test_parameters_change_while_driving_or_are_refused(skid_steer, peer, eventu
     )
 
 
-def test_heading_is_held_by_the_imu_and_only_while_driving(skid_steer, peer, eventually):
-    # A busy machine must not let the imu or the command time out: the hold would begin anew.
+def test_heading_is_held_from_imu_only_while_driving(skid_steer, peer, eventually):
+    # Neither imu nor command may time out on a busy machine: the hold would restart.
     patient = ("-p", "imu_timeout:=60.0", "-p", "cmd_vel_timeout:=60.0")
     skid_steer("-p", "heading_hold:=true", "-p", "heading_i:=0.0", *patient)
 
@@ -199,7 +199,7 @@ def test_heading_is_held_by_the_imu_and_only_while_driving(skid_steer, peer, eve
         peer.imu.publish(message)
         peer.command(v)
 
-    # Wheels that turn say that cmd_vel is heard, not that the imu is.
+    # Turning wheels show that cmd_vel is received, not that the imu is.
     missing = "heading is not held: no imu"
     repeatedly(peer, lambda: peer.command(0.0), lambda: peer.diagnosis(missing), eventually)
     repeatedly(
@@ -215,7 +215,7 @@ def test_heading_is_held_by_the_imu_and_only_while_driving(skid_steer, peer, eve
 
 
 @pytest.mark.parametrize("end", ["interrupt", "terminate"])
-def test_wheels_are_left_at_zero_on_exit(skid_steer, peer, eventually, end):
+def test_wheels_are_commanded_to_zero_on_exit(skid_steer, peer, eventually, end):
     started = skid_steer()
     repeatedly(peer, lambda: peer.command(0.5), lambda: peer.drives(5.0, 5.0), eventually)
     if end == "interrupt":
@@ -230,6 +230,6 @@ def test_wheels_are_left_at_zero_on_exit(skid_steer, peer, eventually, end):
 @pytest.mark.parametrize(
     "row", next(case["table"] for case in BEHAVIOUR if case["id"] == "frame_prefix"), ids=str
 )
-def test_frames_are_prefixed_as_by_diff_drive_controller(row):
+def test_frame_prefix_matches_diff_drive_controller(row):
     prefix = frame_prefix(row["enable"], row["prefix"], row["ns"] or "/")
     assert prefix + "odom" == row["odom"]

@@ -12,8 +12,8 @@ from rosgraph_msgs.msg import Clock
 from smp_interfaces.msg import MotorState
 
 
-def test_odometry_follows_simulated_time_at_half_the_pace(skid_steer, peer, eventually):
-    """At 1 rad/s of simulated time the body moves at 0.1 m/s of it, whatever passes outside."""
+def test_odometry_follows_simulated_time_at_half_speed(skid_steer, peer, eventually):
+    """At 1 rad/s of simulated time the body moves at 0.1 m/s of simulated time."""
     clock = peer.node.create_publisher(Clock, "/clock", 10)
     skid_steer("-p", "use_sim_time:=true")
     eventually(lambda: peer.diagnosis("/clock is not published"), deadline=5.0, step=peer.spin)
@@ -43,7 +43,7 @@ def test_odometry_follows_simulated_time_at_half_the_pace(skid_steer, peer, even
     assert peer.odometry[-1].pose.pose.position.x < 0.1 * 0.5 * (time.monotonic() - begun) + 0.01
 
 
-def test_odometry_goes_on_when_the_clock_is_set_back(skid_steer, peer, eventually):
+def test_odometry_continues_after_clock_jumps(skid_steer, peer, eventually):
     """ros-controls/ros_controllers issue 101: silence until the clock has caught up."""
     clock = peer.node.create_publisher(Clock, "/clock", 10)
     skid_steer("-p", "use_sim_time:=true")
@@ -70,7 +70,7 @@ def test_odometry_goes_on_when_the_clock_is_set_back(skid_steer, peer, eventuall
         assert abs(peer.odometry[-1].twist.twist.linear.x) < 0.2
 
 
-def test_a_body_that_stands_has_no_speed_at_all(skid_steer, peer, eventually):
+def test_speed_is_exactly_zero_at_standstill(skid_steer, peer, eventually):
     """ros-controls/ros2_controllers issue 1972: 5e-14 m/s for ever."""
     skid_steer()
     repeatedly(peer, lambda: peer.roll(2.0), lambda: len(peer.odometry) > 30, eventually)
@@ -82,7 +82,7 @@ def test_a_body_that_stands_has_no_speed_at_all(skid_steer, peer, eventually):
 
 
 def test_odometry_has_no_spikes_after_stalls(skid_steer, peer, eventually):
-    """The reference is the speed of the wheels as they are fed: 2 rad/s, 0.2 m/s."""
+    """The true speed is that of the feedback: 2 rad/s, 0.2 m/s."""
     started = skid_steer()
 
     def roll() -> None:
@@ -103,7 +103,7 @@ def test_odometry_has_no_spikes_after_stalls(skid_steer, peer, eventually):
     assert max(speeds) < 1.2 * 0.2
 
 
-def test_odometry_follows_the_wheels_from_any_first_position(skid_steer, peer, eventually):
+def test_odometry_starts_at_zero_for_any_initial_wheel_position(skid_steer, peer, eventually):
     skid_steer("-p", "feedback_timeout:=60.0")
     # Wheels that start at 1000 and 2000 rad, and then roll 1 rad: 0.1 m.
     repeatedly(
@@ -122,7 +122,7 @@ def test_odometry_follows_the_wheels_from_any_first_position(skid_steer, peer, e
     )
     last = peer.odometry[-1]
     assert (last.header.frame_id, last.child_frame_id) == ("odom", "base_link")
-    # A tick may fall between the four samples of 0.01 rad: 1.25 mrad askew for a way of 1 mm.
+    # An update may fall between the four samples of 0.01 rad: 1.25 mrad of heading over 1 mm.
     assert last.pose.pose.position.y == pytest.approx(0.0, abs=2e-4)
     # travel_noise of 1e-4 m^2/m on two sides, 0.1 m: (1e-4 * 0.2) / 4.
     assert last.pose.covariance[0] == pytest.approx(5e-6, rel=0.02)
@@ -131,7 +131,7 @@ def test_odometry_follows_the_wheels_from_any_first_position(skid_steer, peer, e
     assert sorted(peer.joints[-1].name) == sorted(JOINTS)
 
 
-def test_odometry_is_also_on_tf_where_tf2_msgs_is_installed(skid_steer, peer, eventually):
+def test_odometry_is_also_published_on_tf_if_tf2_msgs_is_installed(skid_steer, peer, eventually):
     tf2_msgs = pytest.importorskip("tf2_msgs.msg", reason="tf2_msgs is not among the wheels")
     seen: list = []
     peer.node.create_subscription(
@@ -153,7 +153,7 @@ def test_odometry_is_also_on_tf_where_tf2_msgs_is_installed(skid_steer, peer, ev
     assert same[0].pose.pose.orientation == seen[-1].transform.rotation
 
 
-def test_lost_or_nan_feedback_is_named_and_never_reaches_the_odometry(skid_steer, peer, eventually):
+def test_invalid_feedback_is_reported_and_never_reaches_odometry(skid_steer, peer, eventually):
     skid_steer()
     repeatedly(peer, lambda: peer.feed_all(0.0, 0.0), lambda: peer.odometry, eventually)
 

@@ -108,7 +108,7 @@ def robot(ros_domain: int) -> Iterator[Listener]:
 
 @pytest.fixture
 def ready(terminal, robot, eventually):
-    """Start it, and wait until the robot hears it and it reads keys."""
+    """Start it, and wait until the robot has discovered it and it reads keys."""
 
     def run(*command: str) -> Terminal:
         started = terminal(*command)
@@ -130,7 +130,7 @@ def hold(key: str, shell: Terminal, robot: Listener, condition, eventually) -> N
     eventually(condition, deadline=5.0, step=press)
 
 
-def test_held_key_drives_and_its_release_stops_then_is_silent(ready, robot, eventually):
+def test_held_key_drives_and_release_stops_then_silences_commands(ready, robot, eventually):
     shell = ready()
     robot.spin_for(0.3)
     assert robot.twists == []
@@ -187,7 +187,7 @@ def test_leaving_stops_the_robot_and_restores_the_terminal(ready, robot, eventua
     assert "Traceback" not in shell.shown
 
 
-def test_suspending_stops_and_continuing_takes_the_keys(ready, robot, eventually):
+def test_suspending_stops_the_robot_and_continuing_reads_keys_again(ready, robot, eventually):
     shell = ready()
     hold("w", shell, robot, lambda: robot.linear() == 0.2, eventually)
     shell.type("\x1a")
@@ -215,7 +215,7 @@ def test_exception_in_the_node_restores_the_terminal(terminal, eventually):
     eventually(lambda: "broken" in shell.shown)
 
 
-def test_impossible_speed_is_refused_and_the_terminal_left_alone(terminal, eventually):
+def test_invalid_speed_is_refused_and_terminal_left_unchanged(terminal, eventually):
     shell = terminal("teleop_wheels", "--ros-args", "-p", "linear_speed:=-1.0")
     eventually(lambda: shell.process.poll() is not None, deadline=20.0)
     assert shell.process.returncode == 2

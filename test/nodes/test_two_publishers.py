@@ -16,12 +16,12 @@ from smp_motor_control.nodes.robot_client import RobotClient, RobotError
 WHEELS = ("left", "right")
 STUCK = ["--ros-args", "-r", "__ns:=/left", "-p", "p:=2.0", "-p", "stall_time:=0.0",
          "-p", "tracking_time:=0.0"]  # fmt: skip
-"""Arguments of a wheel_pid that takes no offence at a wheel that never turns."""
+"""Arguments of a wheel_pid that tolerates a wheel that never turns."""
 BOTH = "/left/motor_state comes from /driver and /forgotten at once; end one of them"
 
 
 class Driver(DomainNode):
-    """Publishes the states of two wheels, each standing somewhere else."""
+    """Publishes the states of two wheels at a fixed position."""
 
     def __init__(self, domain: int, name: str, position: float) -> None:
         super().__init__(domain, name)
@@ -83,14 +83,16 @@ def robot(ros_domain: int) -> Iterator[Robot]:
         robot.forgotten.close()
 
 
-def names(*parameters: str) -> list[str]:
+def parameter_arguments(*parameters: str) -> list[str]:
     return ["--ros-args", *(part for one in parameters for part in ("-p", one))]
 
 
-def test_every_reader_names_both_and_the_wheel_stands(process, robot, eventually):
+def test_every_reader_reports_both_publishers_and_the_wheel_stops(process, robot, eventually):
     process("wheel_pid", *STUCK)
-    process("skid_steer", *names("left_wheel_names:=[left]", "right_wheel_names:=[right]"))
-    process("identifier", *names("wheels:=[left]", "period:=0.5"))
+    process(
+        "skid_steer", *parameter_arguments("left_wheel_names:=[left]", "right_wheel_names:=[right]")
+    )
+    process("identifier", *parameter_arguments("wheels:=[left]", "period:=0.5"))
     recorder = process("record", "--output", "bag")
     nodes = ("left/wheel_pid", "skid_steer", "identifier")
     eventually(lambda: set(nodes) <= set(robot.said), 20.0, robot.run)
@@ -112,7 +114,7 @@ def test_every_reader_names_both_and_the_wheel_stands(process, robot, eventually
     eventually(lambda: robot.voltages[-1] > 0.0, 20.0, robot.run)
 
 
-def test_two_that_command_the_wheels_at_once_are_named(process, robot, eventually):
+def test_two_publishers_of_set_points_are_reported(process, robot, eventually):
     process("wheel_pid", "--ros-args", "-r", "__ns:=/left", "-p", "p:=2.0")
     eventually(lambda: "left/wheel_pid" in robot.said, 20.0, robot.run)
     robot.forget()
@@ -122,7 +124,7 @@ def test_two_that_command_the_wheels_at_once_are_named(process, robot, eventuall
     eventually(lambda: both in robot.said["left/wheel_pid"], 20.0, robot.run, str(robot.said))
 
 
-def test_a_client_refuses_a_wheel_of_two_publishers(robot):
+def test_client_refuses_wheel_with_two_publishers(robot):
     with RobotClient(name="tool") as client:
         client.node.create_timer(0.01, robot.run)
         assert client.wait_for_wheels(WHEELS, 20.0)["left"] > 5.0
@@ -132,11 +134,13 @@ def test_a_client_refuses_a_wheel_of_two_publishers(robot):
                 client.wait_for_wheels(WHEELS, 20.0)
 
 
-def test_states_without_a_stamp_are_named_and_refused_by_tools(process, robot, eventually):
+def test_unstamped_states_are_reported_and_refused_by_tools(process, robot, eventually):
     robot.driver.stamped = False
     process("wheel_pid", *STUCK)
-    process("skid_steer", *names("left_wheel_names:=[left]", "right_wheel_names:=[right]"))
-    process("identifier", *names("wheels:=[left]", "period:=0.5"))
+    process(
+        "skid_steer", *parameter_arguments("left_wheel_names:=[left]", "right_wheel_names:=[right]")
+    )
+    process("identifier", *parameter_arguments("wheels:=[left]", "period:=0.5"))
     for name in ("left/wheel_pid", "skid_steer"):
         eventually(lambda name=name: "no stamp" in robot.said.get(name, ""), 20.0, robot.run)
     # The arrival replaces the stamp: the wheel is driven, and its feedback used.
@@ -148,7 +152,7 @@ def test_states_without_a_stamp_are_named_and_refused_by_tools(process, robot, e
             client.wait_for_wheels(["left"], 20.0)
 
 
-def test_numbers_that_fall_once_are_of_a_publisher_that_was_started_anew():
+def test_single_fall_of_sequence_numbers_is_a_publisher_restart():
     watch = PublisherWatch()
     for start in range(DECISIVE_FALLS - 1):
         assert watch.hear({"publication_sequence_number": 1}) is bool(start)
@@ -161,7 +165,7 @@ def test_numbers_that_fall_once_are_of_a_publisher_that_was_started_anew():
     assert watch.has_two_publishers
 
 
-def test_a_middleware_without_numbers_tells_nothing():
+def test_no_second_publisher_is_reported_without_sequence_numbers():
     watch = PublisherWatch()
     for _ in range(100):
         assert not watch.hear({"publication_sequence_number": None})

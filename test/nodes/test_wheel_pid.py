@@ -101,7 +101,7 @@ def test_one_pid_step_per_sample_with_dt_from_the_stamps(start, robot, eventuall
         before, last = after, dt
 
 
-def test_duplicated_old_or_invalid_feedback_is_left_out(start, robot, eventually):
+def test_duplicate_old_or_invalid_feedback_is_ignored(start, robot, eventually):
     start("p:=2.0", "setpoint_timeout:=30.0")
     feed = Feed(robot, eventually)
     settle(robot, feed)
@@ -127,7 +127,7 @@ def test_duplicated_old_or_invalid_feedback_is_left_out(start, robot, eventually
     assert feed.sample(0.5, encoder_count=-(2**63), **extreme) == pytest.approx(1.0)
 
 
-def test_watchdogs_and_lifecycle_end_in_a_zero_command(start, robot, eventually):
+def test_watchdogs_and_deactivation_command_zero_volts(start, robot, eventually):
     node = start("p:=2.0", "setpoint_timeout:=0.3", "feedback_timeout:=0.3")
     feed = Feed(robot, eventually)
     settle(robot, feed)
@@ -136,7 +136,7 @@ def test_watchdogs_and_lifecycle_end_in_a_zero_command(start, robot, eventually)
     begin = time.monotonic()
     eventually(lambda: feed.sample(0.0) == 0.0, 2.0)
     assert time.monotonic() - begin > 0.1  # how soon after: test_controller, on exact times
-    # Feedback goes on meanwhile: a busy machine may have let that time out first.
+    # Feedback continues meanwhile; on a busy machine it may have timed out first.
     timed_out = "set-point timed out"
     eventually(lambda: feed.sample(0.0) == 0.0 and robot.named(NODE, timed_out, begin), 2.0)
 
@@ -171,7 +171,7 @@ def test_watchdogs_and_lifecycle_end_in_a_zero_command(start, robot, eventually)
     assert feed.commands[-1].voltage == 0.0
 
 
-def test_parameters_change_as_one_without_a_jump_or_not_at_all(start, robot, eventually):
+def test_parameter_change_is_atomic_and_bumpless(start, robot, eventually):
     patient = ("setpoint_timeout:=30.0", "feedback_timeout:=10.0")
     node = start("p:=2.0", "i:=10.0", "u_clamp_max:=12.0", *patient)
     feed = Feed(robot, eventually)
@@ -232,14 +232,14 @@ def test_stall_runaway_and_over_current_switch_the_motor_off(start, robot, event
         )
 
 
-def test_unknown_parameter_and_missing_gains_are_warned_of(start, eventually):
+def test_unknown_parameter_and_missing_gains_cause_warnings(start, eventually):
     node = start("max_velocty:=1.0")
     eventually(lambda: "default gains: p is 1 V s/rad" in node.output, 5.0)
     words = "unknown parameter 'max_velocty' is ignored; did you mean 'max_velocity'?"
     eventually(lambda: words in node.output, 5.0)
 
 
-def test_latched_runaway_waits_for_a_person(start, robot, eventually):
+def test_latched_runaway_is_cleared_only_by_reset(start, robot, eventually):
     start("p:=10.0", "setpoint_timeout:=30.0", "fault_retry:=0.05")
     feed = Feed(robot, eventually)
     settle(robot, feed)
@@ -264,12 +264,12 @@ def test_latched_runaway_waits_for_a_person(start, robot, eventually):
 
 
 def real_time_is_granted() -> bool:
-    """Ask in a process of its own: capabilities, limits and control groups all have a say."""
+    """Return whether SCHED_FIFO is granted, tried in a separate process."""
     asked = "import os; os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(10))"
     return subprocess.run([sys.executable, "-c", asked], capture_output=True).returncode == 0
 
 
-def test_priority_and_processor_hold_for_all_threads(start, robot, eventually):
+def test_priority_and_cpu_affinity_apply_to_all_threads(start, robot, eventually):
     processor = min(os.sched_getaffinity(0))
     node = start("scheduling_priority:=10", f"cpu_affinity:=[{processor}]")
     settle(robot, Feed(robot, eventually))
@@ -282,7 +282,7 @@ def test_priority_and_processor_hold_for_all_threads(start, robot, eventually):
         eventually(lambda: robot.named(NODE, "scheduling_priority 10 not granted"), 3.0, robot.spin)
 
 
-def test_processor_that_is_not_there_is_told_and_done_without(start, robot, eventually):
+def test_nonexistent_cpu_is_reported_and_ignored(start, robot, eventually):
     start("cpu_affinity:=[4000]")
     settle(robot, Feed(robot, eventually))
     eventually(lambda: robot.named(NODE, "cpu_affinity [4000] is not granted"), 3.0, robot.spin)

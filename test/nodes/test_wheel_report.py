@@ -13,7 +13,7 @@ from smp_motor_control.wheel.loop import LoopSettings
 
 
 @pytest.fixture
-def said(monkeypatch):
+def make_report(monkeypatch):
     """Return the log and the assessment of a wheel with these gains."""
 
     def ask(gains, put=lambda wheel: None):
@@ -32,21 +32,21 @@ def said(monkeypatch):
     return ask
 
 
-def test_default_gains_are_reported_in_log_and_diagnostics(said):
-    log, level, message = said(PidGains())
+def test_default_gains_are_reported_in_log_and_diagnostics(make_report):
+    log, level, message = make_report(PidGains())
     assert log == [wheel_report.UNTUNED_TEXT]
     assert wheel_report.UNTUNED_TEXT in message
     assert level == runtime.OK  # nothing is wrong as long as it rests
 
 
-def test_given_gains_are_not_reported(said):
-    log, _, message = said(PidGains(p=2.0, i=30.0))
+def test_configured_gains_are_not_reported(make_report):
+    log, _, message = make_report(PidGains(p=2.0, i=30.0))
     assert log == []
     assert "gains" not in message
     assert "defaults" not in message
 
 
-def test_feedback_slower_than_its_time_out_is_reported_with_both(said):
+def test_feedback_slower_than_time_out_is_reported_with_both_times(make_report):
     def feed(wheel: WheelController) -> None:
         wheel.activate(100.0)
         for k in range(1, 5):
@@ -55,14 +55,16 @@ def test_feedback_slower_than_its_time_out_is_reported_with_both(said):
             state = SimpleNamespace(voltage=0.0, current=0.0, velocity=0.0, encoder_count=0)
             wheel.take_feedback(state, round(1e9 * now), round(1e9 * now), now)
 
-    _, level, message = said(PidGains(p=2.0), feed)
+    _, level, message = make_report(PidGains(p=2.0), feed)
     assert level == runtime.ERROR
     assert "came 0.25 s after the previous one, and feedback_timeout is 0.2 s" in message
-    _, _, message = said(PidGains(p=2.0), lambda wheel: wheel.activate(0.0) or wheel.tick(9.0))
+    _, _, message = make_report(
+        PidGains(p=2.0), lambda wheel: wheel.activate(0.0) or wheel.tick(9.0)
+    )
     assert message.startswith("no feedback: 0 V") and "feedback_timeout" not in message
 
 
-def test_an_oscillation_is_reported_with_advice(said):
+def test_oscillation_is_reported_with_advice(make_report):
     def swing(wheel: WheelController) -> None:
         wheel.activate(100.0)
         for k in range(1, 401):
@@ -72,7 +74,7 @@ def test_an_oscillation_is_reported_with_advice(said):
             state = SimpleNamespace(voltage=0.0, current=0.0, velocity=speed, encoder_count=k)
             wheel.take_feedback(state, round(1e9 * now), round(1e9 * now), now)
 
-    _, level, message = said(PidGains(p=2.0), swing)
+    _, level, message = make_report(PidGains(p=2.0), swing)
     assert level == runtime.WARN
     assert "oscillates by 0.88 rad/s around 1.5 rad/s at 6.3 Hz" in message
     assert "feedback at 50 Hz; halve p, i and d, or design them with tune --rate 50" in message

@@ -26,10 +26,10 @@ def recording(position) -> WheelRecording:
         (lambda angle: angle if angle < 9.0 else angle - 9.0, "jumped"),
     ],
 )
-def test_a_position_that_no_odometry_can_use_is_named(position, words):
+def test_position_unusable_for_odometry_is_reported(position, words):
     said = recording(position).position_problem()
     assert words in said and bool(words) is bool(said)
 
 
-def test_an_empty_recording_has_no_problem():
+def test_empty_recording_has_no_position_problem():
     assert WheelRecording().position_problem() == ""

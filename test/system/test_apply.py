@@ -98,7 +98,7 @@ class Robot:
         assert all(one.successful for one in results), results
 
     def _ask(self, client, request):
-        """Ask until there is an answer: one is lost where discovery is half-way."""
+        """Repeat a request until it is answered: one is lost while discovery is incomplete."""
         end = time.monotonic() + 20.0
         while time.monotonic() < end:
             answered = threading.Event()
@@ -109,7 +109,7 @@ class Robot:
         pytest.fail(f"{client.srv_name} does not answer within 20 s")
 
     def slowest(self, begin: float, end: float) -> float:
-        """Least mean speed of any wheel over any tenth of a second of a stretch of time."""
+        """Return the lowest mean speed of any wheel over any tenth of a second of an interval."""
         least = SPEED
         for seen in self.speeds.values():
             values = [v for t, v in list(seen) if begin < t < end]
@@ -178,7 +178,7 @@ def write_gains(path: Path, gains: dict[str, float]) -> None:
 
 
 def begin_trial(process, robot, eventually, folder, seconds):
-    """Apply other gains, and return the tool that watches them."""
+    """Apply other gains, and return the tool that supervises the trial."""
     write_gains(folder / "other.yaml", {"p": 1.1})
     tune = process(*TUNE, "--gains", folder / "other.yaml", "--apply", "--watch", seconds)
     for wheel in WHEELS:
@@ -187,10 +187,10 @@ def begin_trial(process, robot, eventually, folder, seconds):
 
 
 BAD = ({"p": 400.0, "i": 4000.0}, {"p": -2.0, "i": -40.0}, {"d": 5.0})
-"""Unstable, of the wrong sign, and deaf from the noise of the counts."""
+"""Unstable gains, gains of the wrong sign, and a derivative gain saturated by count noise."""
 
 
-def test_bad_gains_are_taken_back_within_two_seconds(process, robot, eventually, tmp_path):
+def test_bad_gains_are_reverted_within_two_seconds(process, robot, eventually, tmp_path):
     gains = tmp_path / "bad.yaml"
     for bad in BAD:
         write_gains(gains, bad)
@@ -205,7 +205,7 @@ def test_bad_gains_are_taken_back_within_two_seconds(process, robot, eventually,
         eventually(robot.at_speed, deadline=20.0, message="did not drive on")
 
 
-def test_a_wheel_that_stops_in_the_trial_is_settled_when_it_returns(
+def test_controller_suspended_in_trial_gets_old_gains_on_return(
     process, robot, eventually, tmp_path
 ):
     tune = begin_trial(process, robot, eventually, tmp_path, seconds=20)
@@ -217,7 +217,7 @@ def test_a_wheel_that_stops_in_the_trial_is_settled_when_it_returns(
     assert [robot.gain(wheel) for wheel in WHEELS] == [1.0] * len(WHEELS)
 
 
-def test_a_killed_tool_leaves_the_gains_as_they_were(process, robot, eventually, tmp_path):
+def test_old_gains_are_restored_after_tool_is_killed(process, robot, eventually, tmp_path):
     tune = begin_trial(process, robot, eventually, tmp_path, seconds=60)
     tune.send_signal(signal.SIGKILL)
     for wheel in WHEELS:
@@ -232,14 +232,16 @@ def test_apply_without_running_wheels_is_refused(process):
     assert "Traceback" not in output
 
 
-def period_with(motor, delay: float) -> float:
-    """Period at which a motor and a delay turn the phase by half a revolution [s]."""
+def ultimate_period(motor, delay: float) -> float:
+    """Return the ultimate period of a motor with a delay [s]."""
     w = np.geomspace(1.0, 1e4, 20_000)
     phase = np.unwrap(-np.angle(motor.a0 + 1j * w * motor.a1 - w**2 * motor.a2)) - w * delay
     return float(2 * math.pi / w[np.argmax(phase < -math.pi)])
 
 
-def test_relay_on_a_running_wheel_gives_gains_without_a_model(process, robot, eventually, tmp_path):
+def test_relay_test_on_running_wheel_gives_gains_without_model(
+    process, robot, eventually, tmp_path
+):
     output = tmp_path / "relay.yaml"
     # Ten seconds hold enough cycles between the pauses of a busy machine.
     options = ("--supply", "12", "--relay-seconds", "10", "--output", output)
@@ -258,12 +260,12 @@ def test_relay_on_a_running_wheel_gives_gains_without_a_model(process, robot, ev
     # The loop lags by a sample of latching, half of hold and half of averaging at least, so it
     # cannot run_relay_test faster than the model does with these; nor, while it is a loop at all,
     # slower than with a fifth of a second, at which wheel_pid itself calls feedback lost.
-    assert period_with(m, 2 * PERIOD) / 1.15 < period < period_with(m, 0.2)
+    assert ultimate_period(m, 2 * PERIOD) / 1.15 < period < ultimate_period(m, 0.2)
     # The controller has the wheel again.
     eventually(robot.at_speed, deadline=20.0, message="did not drive on")
 
 
-def test_apply_changes_four_running_wheels_without_a_stop(process, robot, tmp_path):
+def test_apply_changes_gains_of_four_running_wheels_without_a_stop(process, robot, tmp_path):
     # Design first, so that the load of designing does not disturb the wheels during the change.
     # A machine that runs tests responds late at times: design gains for 20 ms.
     gains = tmp_path / "good.yaml"

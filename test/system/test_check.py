@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The guards of `make check` that look at what is tracked."""
+"""The guards of `make check` that inspect tracked files."""
 
 import shutil
 import subprocess
@@ -31,7 +31,7 @@ def check(tmp_path: Path) -> Callable[..., subprocess.CompletedProcess[str]]:
     return run
 
 
-def test_python_files_without_a_licence_are_named(check):
+def test_python_files_without_a_licence_are_reported(check):
     sound = {"a.py": HEADER + "x = 1\n", "b.py": f"#!/usr/bin/env python3\n{HEADER}", "c.py": ""}
     assert check("licence", sound).returncode == 0
     done = check("licence", {"folder/d.py": "x = 1\n", "e.py": HEADER.replace("Apache", "MIT")})
@@ -40,7 +40,7 @@ def test_python_files_without_a_licence_are_named(check):
     assert "a.py" not in done.stdout.split()
 
 
-def test_headers_are_inserted_behind_the_interpreter_and_only_once(check, tmp_path):
+def test_licence_header_is_inserted_once_after_the_shebang(check, tmp_path):
     check("licence", {"a.py": "x = 1\n", "b.py": "#!/usr/bin/env python3\ny = 1\n", "c.py": ""})
     for _ in range(2):
         subprocess.run([tmp_path / "scripts/licence.sh", "insert"], cwd=tmp_path, check=True)
@@ -66,7 +66,7 @@ def test_headers_are_inserted_behind_the_interpreter_and_only_once(check, tmp_pa
         "docs/.DS_Store",
     ],
 )
-def test_files_that_tools_left_behind_are_named(check, name):
+def test_leftover_files_of_tools_are_reported(check, name):
     assert check("leftovers", {"cache.py": "", ".gitignore": "", ".ci/run": ""}).returncode == 0
     done = check("leftovers", {name: "x"})
     assert done.returncode == 1

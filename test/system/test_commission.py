@@ -27,7 +27,7 @@ BUSY = (
 """Findings that a busy machine may cause."""
 
 
-def test_it_checks_identifies_tunes_drives_and_applies_later(
+def test_commission_checks_identifies_tunes_drives_and_applies_later(
     process, ros_domain, eventually, tmp_path
 ):
     space = ("--ros-args", "-r", "__ns:=/robot1")
@@ -85,7 +85,7 @@ def test_it_checks_identifies_tunes_drives_and_applies_later(
         robot.close()
 
 
-def test_two_robots_on_one_topic_are_named_before_anything_moves(
+def test_two_publishers_on_one_topic_are_reported_before_motion(
     process, robot, eventually, tmp_path
 ):
     process("motor_plant")
@@ -121,7 +121,7 @@ def test_a_killed_or_suspended_commission_restores_the_controllers(
     eventually(follows, 15.0, robot.spin, "the controller is not active again")
 
 
-def test_nothing_moves_without_a_word(process, robot, eventually, tmp_path):
+def test_nothing_moves_without_confirmation(process, robot, eventually, tmp_path):
     process("motor_plant")
     eventually(lambda: all(robot.states[w] for w in WHEELS), 30.0, robot.spin, "no robot")
     tool = process("commission", "--output", "r")
@@ -132,7 +132,7 @@ def test_nothing_moves_without_a_word(process, robot, eventually, tmp_path):
     assert not (tmp_path / "r").exists()
 
 
-def test_a_robot_that_is_not_there_is_named(process, tmp_path):
+def test_missing_robot_is_reported(process, tmp_path):
     tool = process("commission", "--output", "r", "--yes", "--wheel", "rear_left")
     assert tool.wait(60.0) == 1
     assert "/rear_left/motor_state" in tool.output

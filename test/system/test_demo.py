@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The demo as its user runs it: once to the end, and ended half-way in three ways."""
+"""The demo as its user runs it: once to the end, and interrupted in three ways."""
 
 import json
 import math
@@ -26,8 +26,8 @@ LIMIT = 150.0
 """Longest time of the demo [s] on two free cores."""
 
 
-def alive(mark: str) -> list[int]:
-    """Processes of the demo that carries the mark in its environment."""
+def find_processes(mark: str) -> list[int]:
+    """Return the processes whose environment contains the mark."""
     found = []
     for entry in Path("/proc").iterdir():
         if not entry.name.isdigit():
@@ -46,12 +46,12 @@ def alive(mark: str) -> list[int]:
 def mark() -> Iterator[str]:
     name = f"smp-demo-{uuid.uuid4()}"
     yield name
-    for pid in alive(name):  # only where a test has failed
+    for pid in find_processes(name):  # only where a test has failed
         os.kill(pid, signal.SIGKILL)
 
 
 def assert_page_shows(output: str, *, idle: bool) -> None:
-    """Compare the page's excerpt with a run: another run scatters as its deviations say."""
+    """Compare the page's excerpt with a run, within the standard deviations of both."""
     shown = [line for line in PAGE.read_text().split("```text\n")[1].split("```")[0].splitlines()
              if line.strip()]  # fmt: skip
     fresh = [line for line in output.split("Front left: ")[1].split("Front right: ")[0].splitlines()
@@ -59,7 +59,7 @@ def assert_page_shows(output: str, *, idle: bool) -> None:
     fresh[0] = f"Front left: {fresh[0]}"
     fresh += [line for line in output.splitlines() if line.startswith("ok ")]
     for a, b in zip(shown, fresh, strict=True):
-        # Which wheel a limit is nearest to is chance, and so are small systematic errors.
+        # The wheel nearest to a limit is random, and so are small systematic errors.
         where = re.compile(r" \((-|\w+( \w+)?)\)$|(?<=^systematic: ).*")
         assert shape(where.sub("", a.rstrip())) == shape(where.sub("", b.rstrip()))
         one, other = numbers(a), numbers(b)
@@ -82,14 +82,14 @@ def assert_page_shows(output: str, *, idle: bool) -> None:
 
 @pytest.mark.alone
 @pytest.mark.slow
-def test_the_demo_shows_everything_and_leaves_nothing_running(process, mark, tmp_path):
+def test_demo_output_matches_its_page_and_no_process_remains(process, mark, tmp_path):
     idle = os.getloadavg()[0] < 1.0
     begun = time.monotonic()
     demo = process("demo", "--output", "result", env={"SMP_MARK": mark})
     code = demo.wait(4 * LIMIT)
     took = time.monotonic() - begun
     assert code == 0, demo.output
-    assert alive(mark) == []
+    assert find_processes(mark) == []
     assert took < LIMIT or not idle
     result = tmp_path / "result"
     assert (result / "identification" / "report.html").stat().st_size > 100_000
@@ -109,20 +109,20 @@ def test_the_demo_shows_everything_and_leaves_nothing_running(process, mark, tmp
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL])
-def test_an_interrupted_demo_leaves_nothing_running(process, eventually, mark, number):
+def test_no_process_remains_after_interrupted_demo(process, eventually, mark, number):
     demo = process("demo", "--output", "result", env={"SMP_MARK": mark})
     eventually(lambda: "exciting" in demo.output, 90.0, message=demo.output)
-    assert len(alive(mark)) > 2 + len(WHEELS)
+    assert len(find_processes(mark)) > 2 + len(WHEELS)
     demo.send_signal(number)
     code = demo.wait(20.0)
     # A killed demo cannot end its processes: the kernel asks them to, and they need a moment.
-    eventually(lambda: alive(mark) == [], 10.0)
+    eventually(lambda: find_processes(mark) == [], 10.0)
     if number != signal.SIGKILL:
         assert code == 130
         assert "Traceback" not in demo.output
 
 
-def test_an_earlier_folder_of_another_kind_is_left_alone(process, tmp_path):
+def test_existing_folder_of_another_kind_is_not_overwritten(process, tmp_path):
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "thesis.tex").write_text("years of work")
     demo = process("demo", "--output", "mine")

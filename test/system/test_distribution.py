@@ -80,7 +80,7 @@ def test_every_requirement_is_pinned_within_its_range(lock, monkeypatch):
         ), text
 
 
-def test_the_image_runs_what_the_readme_says():
+def test_container_image_runs_the_commands_of_the_readme():
     block = (ROOT / "README.md").read_text().split("## With ROS 2")[1].split("```")[1]
     said = [line.partition("#")[0].strip() for line in block.splitlines()]
     recipe = (ROOT / "Dockerfile").read_text()
@@ -94,7 +94,7 @@ def test_the_image_runs_what_the_readme_says():
     assert (ROOT / ".devcontainer" / container["build"]["dockerfile"]).is_file()
 
 
-def test_one_version_is_released():
+def test_all_packages_have_the_same_version():
     changelogs = ("CHANGELOG.rst", "smp_interfaces/CHANGELOG.rst")
     found = {
         n: re.findall(r"^(\S+) \(\d{4}-\d\d-\d\d\)\n-+$", (ROOT / n).read_text(), re.M)[0]

@@ -29,7 +29,7 @@ def has_mapped(pid: int, library: str) -> bool:
 )
 def test_ctrl_c_while_importing_ends_without_a_traceback(process, eventually, command, code):
     started = process(*command.split())
-    # numpy is among the first that is imported, and far from the last
+    # numpy is among the first modules imported, and far from the last
     eventually(
         lambda: has_mapped(started.pid, "_multiarray_umath") or started.returncode is not None
     )
@@ -42,7 +42,7 @@ def test_ctrl_c_while_importing_ends_without_a_traceback(process, eventually, co
 
 @pytest.mark.parametrize("domain", ["9999", "-1", "first"])
 @pytest.mark.parametrize("executable", ["wheel_pid", "record", "commission"])
-def test_an_impossible_domain_is_named(process, executable, domain):
+def test_invalid_ros_domain_is_reported(process, executable, domain):
     arguments = ("--output", "r", "--yes") if executable == "commission" else ()
     started = process(executable, *arguments, env={"ROS_DOMAIN_ID": domain})
     assert started.wait(30.0) == 2
@@ -52,7 +52,7 @@ def test_an_impossible_domain_is_named(process, executable, domain):
 
 
 def test_linear_algebra_stays_on_one_thread():
-    """A second is waited for in a busy loop: at real-time priority that may never end."""
+    """Waiting for a second thread is a busy loop, which may never end at real-time priority."""
     environment = {k: v for k, v in os.environ.items() if not k.endswith("_NUM_THREADS")}
 
     def threads(before: str) -> int:
@@ -70,7 +70,7 @@ def test_linear_algebra_stays_on_one_thread():
     assert threads("import smp_motor_control.entry") == 1
 
 
-def test_a_missing_package_is_named_with_the_command_to_install_it(process, tmp_path):
+def test_missing_package_is_reported_with_its_install_command(process, tmp_path):
     (tmp_path / "numba.py").write_text("raise ModuleNotFoundError(name='numba')\n")
     for executable in ("identify", "tune", "identifier"):
         path = os.pathsep.join([str(tmp_path), os.environ.get("PYTHONPATH", "")])
@@ -80,7 +80,7 @@ def test_a_missing_package_is_named_with_the_command_to_install_it(process, tmp_
         assert "Traceback" not in started.output
 
 
-def test_pip_gets_break_system_packages_in_a_managed_environment(monkeypatch, tmp_path):
+def test_pip_advice_has_break_system_packages_in_managed_environment(monkeypatch, tmp_path):
     monkeypatch.setattr("sysconfig.get_path", lambda name: str(tmp_path))
     absent = ModuleNotFoundError(name="mcap")
     monkeypatch.setattr(sys, "prefix", sys.base_prefix)
@@ -96,7 +96,7 @@ def test_every_node_has_help(process, executable):
     assert f"usage: {executable}" in started.output
 
 
-def test_ctrl_c_that_a_compiled_module_turns_into_an_import_error_is_ctrl_c(monkeypatch):
+def test_import_error_caused_by_ctrl_c_is_treated_as_ctrl_c(monkeypatch):
     def was_interrupted_on_import(module: str) -> None:
         try:
             try:
@@ -118,7 +118,7 @@ def test_ctrl_c_that_a_compiled_module_turns_into_an_import_error_is_ctrl_c(monk
         entry._make_program("smp_motor_control.nodes.wheel_pid", 0)()
 
 
-def test_ctrl_c_that_python_drops_while_importing_ends_a_node(process, tmp_path):
+def test_ctrl_c_ignored_by_python_during_import_still_ends_a_node(process, tmp_path):
     (tmp_path / "sitecustomize.py").write_text(
         "import os, signal, sys\n"
         "class Dropped:\n"

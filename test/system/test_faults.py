@@ -100,7 +100,9 @@ class Campaign:
 
 
 @pytest.mark.slow
-def test_feedback_faults_stop_the_wheel_are_named_and_driving_resumes(process, robot, eventually):
+def test_feedback_faults_are_reported_stop_the_wheel_and_driving_resumes(
+    process, robot, eventually
+):
     campaign = Campaign(process, robot, eventually)
     relay = campaign.relay
     stopping: list[tuple[str, Callable[[], None], str]] = [
@@ -157,7 +159,7 @@ def extreme(draw: random.Random) -> float:
 
 
 @pytest.mark.slow
-def test_ten_thousand_malformed_and_extreme_messages_kill_nothing(process, robot, eventually):
+def test_nodes_survive_ten_thousand_malformed_and_extreme_messages(process, robot, eventually):
     campaign = Campaign(process, robot, eventually)
     draw = random.Random(5)
     stamps = [0, 1, 2**31 - 1, -1, -(2**31)]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""lab with a simulated robot: the procedure by clicks in a browser, and who may drive, and when."""
+"""lab with a simulated robot: the procedure by clicks in a browser, and access to driving."""
 
 import asyncio
 import contextlib
@@ -83,7 +83,7 @@ def watcher(ros_domain):
 
 
 def address(lab, eventually, after: int = 0) -> str:
-    """Return the newest address that lab printed, once there are more than so many."""
+    """Return the newest address that lab printed, once there are more than ``after``."""
     found = lambda: re.findall(r"http://\S+", lab.output)  # noqa: E731
     eventually(lambda: len(found()) > after or lab.returncode is not None, deadline=60.0)
     assert lab.returncode is None, lab.output
@@ -91,7 +91,7 @@ def address(lab, eventually, after: int = 0) -> str:
 
 
 class Client:
-    """A page without a browser: it beats, drives and reads the state."""
+    """A page without a browser: it sends heartbeats, drives and reads the state."""
 
     def __init__(self, url: str) -> None:
         self.origin = url.partition("/?")[0]
@@ -140,7 +140,7 @@ class Client:
                 self.refusals.append(content)
 
     async def arm(self) -> None:
-        """Arm, again where something else was still under way."""
+        """Arm, and repeat while another job is running."""
         while not self.state.get("armed"):
             if not self.state["job"]:
                 await self.send("arm")
@@ -171,7 +171,7 @@ def two_wheels(process, watcher, eventually, tmp_path):
 
 
 async def drive_and_cut(lab, watching, moved: str, cut: str, pages: Iterator[str]) -> float:
-    """Move the wheels by a page of its own; return the instant at which that ends."""
+    """Move the wheels by a new page; return the time of the interruption."""
     async with contextlib.AsyncExitStack() as stack:
         page = await stack.enter_async_context(Client(next(pages)))
         await page.until(lambda: page.role.get("drives") and page.state.get("wheels"))
@@ -211,7 +211,7 @@ async def drive_and_cut(lab, watching, moved: str, cut: str, pages: Iterator[str
         ("excited", ("suspended",)),
     ],
 )
-def test_wheels_stop_within_half_a_second(two_wheels, eventually, moved, cuts):
+def test_wheels_stop_within_half_a_second_of_any_interruption(two_wheels, eventually, moved, cuts):
     lab, watching = two_wheels
     pages = (address(lab, eventually, opened) for opened in itertools.count())
     for cut in cuts:
@@ -220,7 +220,7 @@ def test_wheels_stop_within_half_a_second(two_wheels, eventually, moved, cuts):
         assert watching.stood_after(cut_at) < longest, cut
 
 
-def test_strangers_stay_outside_and_one_page_drives(two_wheels, eventually):
+def test_access_needs_a_token_and_only_one_page_drives(two_wheels, eventually):
     lab, watching = two_wheels
     url = address(lab, eventually)
     origin, _, token = url.partition("/?token=")
@@ -292,7 +292,7 @@ def test_strangers_stay_outside_and_one_page_drives(two_wheels, eventually):
 @pytest.mark.parametrize(
     ("host", "own"), [("0.0.0.0", "http://127.0.0.1:"), ("::", "http://[::1]:")]
 )
-def test_a_server_of_all_interfaces_warns_and_prints_an_address_that_opens(
+def test_server_on_all_interfaces_warns_and_prints_a_working_address(
     process, eventually, ros_domain, host, own
 ):
     demo = ("--demo", "--domain", str(ros_domain))
@@ -309,14 +309,14 @@ def test_a_server_of_all_interfaces_warns_and_prints_an_address_that_opens(
     asyncio.run(watch())
 
 
-def test_a_wheel_name_that_holds_html_is_refused(process):
+def test_wheel_name_with_html_is_refused(process):
     lab = process("lab", "--no-browser", "--wheel", "<img src=x onerror=alert(1)>")
     assert lab.wait(30.0) == 2
     assert "<img" in lab.output and "Traceback" not in lab.output
 
 
 @pytest.mark.skipif(not CHROMIUM, reason="no Chromium on this machine")
-def test_the_whole_procedure_by_clicks(two_wheels, eventually, tmp_path):
+def test_whole_procedure_works_by_clicks(two_wheels, eventually, tmp_path):
     lab, watching = two_wheels
     url = address(lab, eventually)
     results = tmp_path / "lab_output"
@@ -327,7 +327,7 @@ def test_the_whole_procedure_by_clicks(two_wheels, eventually, tmp_path):
         for name in ("excite", "identify", "tune", "apply", "step", "keep", "back"):
             assert page.value(f"document.getElementById('{name}').disabled"), name
         assert max(map(abs, watching.speeds())) < STANDSTILL
-        # A message is text, whatever it holds.
+        # A message is shown as text even if it contains HTML.
         evil = "<img src=x onerror=window.broken=1>"
         status = DiagnosticStatus(name="left/wheel_pid", message=evil, level=b"\1")
         shown = f"document.querySelector('#diagnostics').textContent.includes({evil!r})"

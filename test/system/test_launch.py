@@ -48,7 +48,7 @@ def test_launch_file_starts_plant_wheels_and_body_of_any_robot(tmp_path):
         module.start(context)
 
 
-def test_parameter_file_speaks_to_the_nodes_of_every_robot(tmp_path):
+def test_parameter_file_applies_to_nodes_in_any_namespace(tmp_path):
     gains = LAUNCH.parents[1] / "config" / "gains.yaml"
     require_nodes(gains, [f"/{wheel}/wheel_pid" for wheel in WHEELS])
     require_nodes(gains, [f"/a/b/{wheel}/wheel_pid" for wheel in WHEELS])
@@ -58,7 +58,7 @@ def test_parameter_file_speaks_to_the_nodes_of_every_robot(tmp_path):
         require_nodes(tmp_path / "none.yaml", [])
 
 
-def test_parameters_of_a_node_are_those_of_any_namespace(tmp_path):
+def test_node_parameters_are_read_from_any_namespace(tmp_path):
     file = tmp_path / "robot.yaml"
     file.write_text(
         "/**: {ros__parameters: {use_sim_time: true}}\n"
@@ -69,7 +69,7 @@ def test_parameters_of_a_node_are_those_of_any_namespace(tmp_path):
     assert found == {"use_sim_time": True, "left_wheel_names": ["left"]}
 
 
-def test_launch_file_is_python_that_names_real_executables_and_files():
+def test_launch_file_compiles_and_names_existing_files():
     text = LAUNCH.read_text()
     compile(text, LAUNCH.name, "exec")
     root = LAUNCH.parents[1]

@@ -14,7 +14,7 @@ import threading
 from pathlib import Path
 
 import pytest
-from test_documentation import ROOT, commands, motion, of_language, write_bag
+from test_documentation import ROOT, blocks_in, commands, motion, write_bag
 from wheel_robot import CONFIG, WheelRobot, two_wheeled
 
 from smp_motor_control import WHEELS
@@ -26,23 +26,23 @@ NEEDS = (DRIVES, "# needs a running robot", "# needs a terminal and a running ro
 SPEED = 1.2
 """Of a robot that drives [rad/s]."""
 ENDLESS = ("record", "identifier", "teleop_wheels", "ros2")
-"""What runs until Ctrl-C."""
-LOOKED_AT = 12.0
-"""For how long such a command is let run [s]."""
+"""Commands that run until Ctrl-C."""
+ENDLESS_RUN_TIME = 12.0
+"""Run time of such a command in the test [s]."""
 LIMIT = 900.0
-"""Of a command that ends by itself [s]; ``commission`` takes two minutes on two free cores."""
+"""Time limit of other commands [s]; ``commission`` takes two minutes on two free cores."""
 ELSEWHERE = ("plotjuggler", "foxglove_bridge", "nav2_bringup", "teleop_twist_joy")
-"""Packages of others, which need a screen or a robot's map."""
+"""External packages, which need a screen or a map."""
 
 
-def printed() -> list[tuple[str, list[str]]]:
-    blocks = [(page, lines) for page, lines in of_language("sh") if lines[0].strip() in NEEDS]
+def find_robot_blocks() -> list[tuple[str, list[str]]]:
+    blocks = [(page, lines) for page, lines in blocks_in("sh") if lines[0].strip() in NEEDS]
     here = shutil.which("ros2")
     return [b for b in blocks if here or not any(line.startswith("ros2 ") for line in b[1])]
 
 
 def run(line: str, folder: Path) -> str:
-    """Run a printed line in a terminal; return what went wrong."""
+    """Run a printed line in a terminal; return an error message or an empty string."""
     here, there = os.openpty()
     log = folder / "output.txt"
     with log.open("wb") as out:
@@ -53,7 +53,7 @@ def run(line: str, folder: Path) -> str:
         os.write(here, b"y\n")
         endless = line.split()[0] in ENDLESS and "--show-args" not in line
         try:
-            process.wait(LOOKED_AT if endless else LIMIT)
+            process.wait(ENDLESS_RUN_TIME if endless else LIMIT)
         except subprocess.TimeoutExpired:
             if not endless:
                 os.killpg(process.pid, signal.SIGKILL)
@@ -114,7 +114,7 @@ def robots(ros_domain, process, eventually, tmp_path):
 
 
 @pytest.mark.long
-@pytest.mark.parametrize(("page", "lines"), printed())
+@pytest.mark.parametrize(("page", "lines"), find_robot_blocks())
 def test_commands_for_a_running_robot_work_as_their_page_describes(page, lines, tmp_path, robots):
     write_bag(tmp_path / "my_bag", motion(1), own=True, current=True)
     answered = identify.main([str(tmp_path / "my_bag"), "--output", str(tmp_path / "result"), "-q"])

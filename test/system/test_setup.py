@@ -64,7 +64,7 @@ def run(clone, path, *, command=("scripts/setup.sh",), **extra):
 
 
 def assert_refused(result, clone, *words):
-    """The last line is the only one on stderr, holds the words, and nothing counts as set up."""
+    """Assert that stderr is one line with the words, and that nothing counts as set up."""
     assert result.returncode == 1
     assert result.stderr.count("\n") == 1, result.stderr
     for word in words:
@@ -76,19 +76,19 @@ def test_missing_python_is_reported_with_the_package_to_install(clone, machine):
     assert_refused(run(clone, machine), clone, "no Python 3.10 to 3.13", "apt install python3")
 
 
-def test_python_out_of_range_is_named(clone, machine):
+def test_invalid_python_executable_is_reported(clone, machine):
     false = shutil.which("false")
     assert_refused(run(clone, machine, PYTHON=false), clone, false, "not a Python 3.10 to 3.13")
 
 
-def test_unsupported_processor_is_named(clone, machine):
+def test_unsupported_processor_is_reported(clone, machine):
     (machine / "uname").unlink()
     (machine / "uname").write_text('#!/bin/sh\n[ "$1" = -s ] && echo Linux || echo aarch64\n')
     (machine / "uname").chmod(0o755)
     assert_refused(run(clone, machine), clone, "Linux on aarch64 is not supported", "x86_64")
 
 
-def test_missing_build_tools_are_all_named_at_once(clone, machine):
+def test_all_missing_build_tools_are_reported_at_once(clone, machine):
     result = run(clone, machine, PYTHON=BASE)
     assert_refused(result, clone, "C compiler", "C++ compiler", "cmake", "make", "apt install")
     assert not (clone / ".venv").exists()
@@ -99,13 +99,13 @@ def test_another_ros_distribution_is_refused(clone):
     assert_refused(result, clone, "humble", "Jazzy")
 
 
-def test_ros_that_is_only_half_sourced_is_refused(clone):
+def test_partially_sourced_ros_is_refused(clone):
     result = run(clone, os.environ["PATH"], PYTHON=BASE, ROS_DISTRO="jazzy")
     assert_refused(result, clone, "AMENT_PREFIX_PATH", "source /opt/ros/jazzy/setup.bash")
 
 
-def test_failed_installation_is_not_taken_as_done(clone):
-    # Port 9 of this machine: nothing listens there, as where no network is.
+def test_failed_installation_does_not_count_as_set_up(clone):
+    # Nothing listens on port 9 of this machine, as if there were no network.
     network = {"PIP_INDEX_URL": "http://127.0.0.1:9/simple", "PIP_RETRIES": "1"}
     network |= {"PIP_CONFIG_FILE": os.devnull, "PIP_NO_CACHE_DIR": "1"}
     result = run(clone, os.environ["PATH"], PYTHON=BASE, **network)
@@ -142,7 +142,7 @@ def keys(clone):
         ("smp_motor_control/motor.py", set()),
     ],
 )
-def test_change_redoes_only_the_stages_that_depend_on_it(clone, path, stages):
+def test_change_repeats_only_dependent_stages(clone, path, stages):
     before = keys(clone)
     changed = clone / path
     changed.parent.mkdir(exist_ok=True)
@@ -159,7 +159,7 @@ def test_second_set_up_waits_for_the_first(clone, process, eventually):
         second = process("scripts/setup.sh", cwd=clone, env=no_ros)
         eventually(lambda: "waiting" in second.output)
         assert second.returncode is None
-    # Once admitted, it reports the fault of this machine: ROS is missing from the given place.
+    # With the lock it reports that ROS is missing.
     assert second.wait(30.0) == 1
 
 
@@ -169,7 +169,7 @@ def ready():
         pytest.skip("this tree was built by colcon alone")
 
 
-def test_set_up_that_is_done_has_nothing_to_say(ready):
+def test_repeated_set_up_is_silent_and_fast(ready):
     for _ in range(2):  # the first may still have something to do
         started = time.monotonic()
         result = run(ROOT, os.environ["PATH"], **ROS)
@@ -178,7 +178,7 @@ def test_set_up_that_is_done_has_nothing_to_say(ready):
     assert elapsed < 3.0  # longest start of a second `make test`
 
 
-def test_shell_from_another_folder_finds_the_executables_and_the_messages(ready, tmp_path):
+def test_shell_in_another_folder_finds_executables_and_messages(ready, tmp_path):
     script = (
         f"set -eu; . '{ROOT}/setup.bash'; command -v wheel_pid identify demo;"
         " python -c 'import rclpy; from smp_interfaces.msg import MotorState; print(MotorState())'"
@@ -188,7 +188,7 @@ def test_shell_from_another_folder_finds_the_executables_and_the_messages(ready,
     assert "encoder_count=0" in result.stdout
 
 
-def test_shell_leaves_discovery_to_its_user(ready, tmp_path):
+def test_shell_does_not_set_discovery_range(ready, tmp_path):
     script = f". '{ROOT}/setup.bash'; env | grep -c '^ROS_AUTOMATIC_DISCOVERY_RANGE'"
     assert run(tmp_path, "/usr/bin:/bin", command=("bash", "-c", script)).stdout == "0\n"
 
@@ -207,7 +207,7 @@ def test_pytest_works_with_a_sourced_launch_testing_plugin(tmp_path):
     assert ran.returncode == 0, ran.stdout + ran.stderr
 
 
-def test_the_root_package_declares_the_dependencies_of_the_inner_one():
+def test_root_package_declares_dependencies_of_smp_interfaces():
     """Where rosdep finds a package.xml, it looks no further down."""
 
     def keys(path: str) -> set[str]:
