@@ -191,7 +191,7 @@ class Clicks:
             time.sleep(0.1)
 
     def click(self, name: str) -> None:
-        """Press a button as soon as it can be."""
+        """Press a button as soon as it is enabled."""
         self.until(f"!document.getElementById('{name}').disabled")
         self.value(f"document.getElementById('{name}').click()")
 

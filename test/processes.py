@@ -55,7 +55,7 @@ def own_domain() -> Iterator[int]:
 
 
 class TestProcess:
-    """A started executable: its output so far, and how to end it."""
+    """A started executable and its output so far."""
 
     __test__ = False
 

@@ -45,7 +45,7 @@ def so_far(bag: Path) -> dict[str, list[bytes]]:
 
 
 def all_states(found: dict[str, list[bytes]]) -> list[int]:
-    """Count each wheel's messages; the bag also holds what nodes log."""
+    """Count each wheel's messages; the bag also holds log messages of nodes."""
     return [len(found.get(f"/{wheel}/motor_state", [])) for wheel in WHEELS]
 
 

@@ -79,7 +79,7 @@ def test_speed_falling_by_over_a_fifth_is_braking_and_not_runaway():
         return ((6.0, -(share ** (k // 8)), 0.0) for k in range(64))
 
     assert first_fault(braked(0.75)) == (0, None)
-    # To 0.8 exactly within the time: not enough.  Then to 0.64: the time begins anew.
+    # A fall to just above 0.8 is not enough; a larger fall restarts the time.
     assert first_fault(braked(0.8 * ABOVE))[0] == 16
     once = chain(repeat((6.0, -1.0, 0.0), 10), repeat((6.0, -0.7, 0.0), 99))
     assert first_fault(once) == (10 + 16, Fault.RUNAWAY)

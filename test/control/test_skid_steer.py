@@ -107,7 +107,7 @@ def test_covariance_matches_monte_carlo_of_noisy_drives():
         odometry.update_from_velocity(left / 0.1, right / 0.1, 1.0)
     predicted = odometry.covariance
     # The sampled deviation of 1000 drives is known to 1/sqrt(2000) = 2.2 %; correlations to
-    # 0.03. Four of those, and 5 % for what linearisation leaves out.
+    # 0.03. Allow four of those, and 5 % for linearisation.
     std = np.sqrt(np.diag(sampled))
     assert np.sqrt(np.diag(predicted)) == pytest.approx(std, rel=0.14)
     assert predicted / np.outer(std, std) == pytest.approx(sampled / np.outer(std, std), abs=0.2)

@@ -206,7 +206,7 @@ def test_clock_offsets_of_64_recent_writers_are_remembered():
     def judged(others: int, again: int = 0) -> bool:
         """Tell whether a late command is refused after commands of others."""
         one = Lease(0.2)
-        assert one.take("late", 3.0, 6.0, 50_000 * MS, 6000 * MS)  # its clock is elsewhere
+        assert one.take("late", 3.0, 6.0, 50_000 * MS, 6000 * MS)  # with a clock offset
         for k in range(others):
             one.take(f"writer {k}", 0.0, 6.1, 6100 * MS, 6100 * MS)
         for _ in range(again):

@@ -305,7 +305,7 @@ def test_only_changed_loop_settings_are_checked():
     bad = replace(SETTINGS, loop=LoopSettings(gains=replace(GAINS, i=-1.0)))
     with pytest.raises(ValueError, match="i is -1"):
         WheelController(SETTINGS).check(bad)
-    given = WheelController(bad)  # as it was started
+    given = WheelController(bad)  # bad settings, but given at the start
     given.check(replace(bad, fault_retry=9.0))
     with pytest.raises(ValueError, match="i is -2"):
         given.check(replace(bad, loop=LoopSettings(gains=replace(GAINS, i=-2.0))))

@@ -116,7 +116,7 @@ def test_speed_source_restarts_when_its_settings_change(change, anew):
     rest(loop, LEARNING_SAMPLES + 1)
     loop.configure(replace(loop.settings, **change))
     assert rest(loop, 1) == [anew]
-    if anew == "difference":  # and is learnt from as many samples as at the start
+    if anew == "difference":  # and the observer learns the interval again
         assert rest(loop, LEARNING_SAMPLES)[-2:] == ["difference", "observer"]
 
 

@@ -9,7 +9,7 @@ from rclpy.qos import DurabilityPolicy, QoSProfile
 from smp_interfaces.msg import MotorParameters
 
 TRUE_GAIN = 25.548
-"""Of motor 1, K / (R b + K^2) of Table 1 [rad/s/V]."""
+"""DC gain of motor 1, K / (R b + K^2) from Table 1 [rad/s/V]."""
 
 
 def test_accurate_estimate_is_published_after_sufficient_excitation(process, robot, eventually):

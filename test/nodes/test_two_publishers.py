@@ -42,7 +42,7 @@ class Driver(DomainNode):
 
 
 class Robot:
-    """A driver, perhaps a forgotten one, and the nodes' diagnostics."""
+    """A driver, optionally a second, forgotten one, and the nodes' diagnostics."""
 
     def __init__(self, domain: int) -> None:
         self.driver = Driver(domain, "driver", 1.0)

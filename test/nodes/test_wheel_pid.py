@@ -135,7 +135,7 @@ def test_watchdogs_and_deactivation_command_zero_volts(start, robot, eventually)
     eventually(drives, 5.0, lambda: robot.send_setpoint(1.0))
     begin = time.monotonic()
     eventually(lambda: feed.sample(0.0) == 0.0, 2.0)
-    assert time.monotonic() - begin > 0.1  # how soon after: test_controller, on exact times
+    assert time.monotonic() - begin > 0.1  # test_wheel_controller checks the exact time
     # Feedback continues meanwhile; on a busy machine it may have timed out first.
     timed_out = "set-point timed out"
     eventually(lambda: feed.sample(0.0) == 0.0 and robot.named(NODE, timed_out, begin), 2.0)

@@ -36,7 +36,7 @@ def test_default_gains_are_reported_in_log_and_diagnostics(make_report):
     log, level, message = make_report(PidGains())
     assert log == [wheel_report.UNTUNED_TEXT]
     assert wheel_report.UNTUNED_TEXT in message
-    assert level == runtime.OK  # nothing is wrong as long as it rests
+    assert level == runtime.OK  # no warning while the wheel is at rest
 
 
 def test_configured_gains_are_not_reported(make_report):

@@ -26,7 +26,7 @@ from smp_motor_ident.tune.methods.rules import RULES
 ROOT = Path(__file__).resolve().parents[2]
 MOTORS = ROOT / "config" / "motors_paper.yaml"
 PERIOD = 1 / 200
-"""Of the plant's samples [s]."""
+"""Sample interval of the plant [s]."""
 
 GAINS = {"p": 1.0, "i": 15.0, "d": 0.0}
 SPEED = 1.2
@@ -257,9 +257,9 @@ def test_relay_test_on_running_wheel_gives_gains_without_model(
     m, w = motor.parameters, 2j * math.pi / period
     response = 1 / (m.a2 * w**2 + m.a1 * w + m.a0) / motor.gearbox.ratio
     assert ultimate * abs(response) == pytest.approx(1.0, rel=0.1)
-    # The loop lags by a sample of latching, half of hold and half of averaging at least, so it
-    # cannot run_relay_test faster than the model does with these; nor, while it is a loop at all,
-    # slower than with a fifth of a second, at which wheel_pid itself calls feedback lost.
+    # The loop lags by at least one sample of latching, half of hold and half of averaging, so its
+    # period exceeds the model's with these. It is shorter than with a delay of 0.2 s, at which
+    # wheel_pid reports that feedback is lost.
     assert ultimate_period(m, 2 * PERIOD) / 1.15 < period < ultimate_period(m, 0.2)
     # The controller has the wheel again.
     eventually(robot.at_speed, deadline=20.0, message="did not drive on")

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""commission on a robot that runs, as its user runs it."""
+"""commission on a running robot, as its user runs it."""
 
 import json
 import signal
@@ -48,7 +48,7 @@ def test_commission_checks_identifies_tunes_drives_and_applies_later(
         )  # fmt: skip
         assert tool.wait(600.0) == 0, tool.output
         begin = tool.output.index("no wheel_pid runs for front_left, rear_left")
-        assert begin < tool.output.index("checking front_left")  # said before anything moves
+        assert begin < tool.output.index("checking front_left")  # reported before anything moves
         estimates = read_identification(tmp_path / "r" / "identification")
         assert set(estimates) == set(TWO)
         # Motor 1 of Table 1; short signals on a busy machine still tell it to a percent.
@@ -61,7 +61,7 @@ def test_commission_checks_identifies_tunes_drives_and_applies_later(
         codes = [f["code"] for f in document["findings"]]
         assert codes.count("validation_run") == len(TWO) and "gear_ratio_unknown" not in codes
         assert [one["name"] for one in document["changes"]] == ["forward", "reverse"] * len(TWO)
-        # Its own controllers have ended with the tool, and what passed is not done again.
+        # Its controllers have ended with the tool, and completed steps are not repeated.
         counted = robot.node.count_publishers
         commands = [f"/robot1/{wheel}/motor_command" for wheel in TWO]
         eventually(lambda: not any(map(counted, commands)), 30.0, robot.spin)

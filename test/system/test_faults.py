@@ -32,7 +32,7 @@ GAINS = (
     "feedback_timeout:=0.4", "setpoint_timeout:=0.5", "stall_time:=0.4", "fault_retry:=1.0",
 )  # fmt: skip
 SAMPLE = 0.01
-"""Of the plant [s]."""
+"""Sample interval of the plant [s]."""
 TIMEOUT = 2.0
 """Longest time-out of all [s], with a second for /diagnostics and a busy machine."""
 
@@ -42,7 +42,7 @@ def stamp(message: MotorState | MotorCommand) -> float:
 
 
 def true_speed(robot: WheelRobot) -> float:
-    """Speed of the plant itself, upstream of the relay."""
+    """Return the speed of the plant, upstream of the relay."""
     last = robot.states["raw"][-10:]
     if len(last) < 10:
         return math.nan
@@ -66,7 +66,7 @@ class Campaign:
         self.drives()
 
     def drives(self) -> None:
-        """Wait until the wheel turns as asked."""
+        """Wait until the wheel follows its set-point."""
         self.eventually(
             lambda: abs(true_speed(self.robot) - SPEED) < 0.1 * SPEED,
             12.0,
@@ -75,7 +75,7 @@ class Campaign:
         )
 
     def is_sound(self) -> None:
-        """Wait until the wheel drives by itself again, then clear the tries of the last fault."""
+        """Wait until the wheel drives by itself again, then reset the retries of the fault."""
         self.drives()
         self.robot.trigger(NODE, "reset")
         self.drives()
@@ -123,7 +123,7 @@ def test_feedback_faults_are_reported_stop_the_wheel_and_driving_resumes(
     since, n = time.monotonic(), len(robot.states["raw"])
     relay.changes(velocity=lambda v: -v, encoder_count=lambda n: -n, position=lambda p: -p)
     campaign.names("runaway", since)
-    # A command bears the stamp of its sample: samples that a busy machine lost are no evidence.
+    # Commands carry the stamp of their sample; samples lost on a busy machine are subtracted.
     begin = stamp(robot.states["raw"][n])
     answers = [(stamp(c), c.voltage) for c in robot.commands[WHEEL] if stamp(c) >= begin]
     end = next(at for at, voltage in answers if voltage == 0.0)
@@ -144,7 +144,7 @@ def test_feedback_faults_are_reported_stop_the_wheel_and_driving_resumes(
     ):
         since = time.monotonic()
         begin()
-        campaign.names(words, since, within=5.0)  # what stops no wheel has no time-out to keep
+        campaign.names(words, since, within=5.0)  # faults that stop no wheel have no time-out
         campaign.drives()
         relay.passes()
         campaign.drives()
@@ -152,7 +152,7 @@ def test_feedback_faults_are_reported_stop_the_wheel_and_driving_resumes(
 
 
 def extreme(draw: random.Random) -> float:
-    """Return a number that a driver should never send, or one that it might."""
+    """Return an extreme or an ordinary random number."""
     return draw.choice(
         [math.nan, math.inf, -math.inf, 1.7e308, -1.7e308, 5e-324, -0.0, draw.gauss(0.0, 1e3)]
     )

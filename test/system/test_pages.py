@@ -24,7 +24,7 @@ DRIVES = "# needs a robot that drives"
 NEEDS = (DRIVES, "# needs a running robot", "# needs a terminal and a running robot",
          "# needs ROS 2")  # fmt: skip
 SPEED = 1.2
-"""Of a robot that drives [rad/s]."""
+"""Wheel speed of a driving robot [rad/s]."""
 ENDLESS = ("record", "identifier", "teleop_wheels", "ros2")
 """Commands that run until Ctrl-C."""
 ENDLESS_RUN_TIME = 12.0

@@ -16,7 +16,7 @@ ROOT = Path(__file__).resolve().parents[2]
 Process = Callable[..., Any]
 
 SPEEDS = {"robot1": 0.1, "robot2": -0.15}
-"""Of the two bodies [m/s]."""
+"""Speeds of the two bodies [m/s]."""
 
 
 def begin(process: Process, robot: str, sides: tuple[str, str], motors: Path, gains: Path) -> None:

@@ -208,7 +208,7 @@ def test_pytest_works_with_a_sourced_launch_testing_plugin(tmp_path):
 
 
 def test_root_package_declares_dependencies_of_smp_interfaces():
-    """Where rosdep finds a package.xml, it looks no further down."""
+    """rosdep does not search below a folder with a package.xml."""
 
     def keys(path: str) -> set[str]:
         root = ElementTree.parse(ROOT / path).getroot()
