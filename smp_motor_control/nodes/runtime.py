@@ -7,6 +7,7 @@ terminal), SIGTSTP (Ctrl-Z: a suspended node cannot stop its wheels), :func:`fin
 exception in a callback.
 """
 
+import math
 import os
 import re
 import signal
@@ -50,6 +51,10 @@ LATCHED = QoSProfile(
 )
 """Descriptions; late subscribers get the last one."""
 
+REPEATED_SIGNAL_S = 1.0
+"""Time in which signals are one request to stop: a terminal, its shell, launch and systemd may each
+send one. A later signal exits at once."""
+
 _SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGQUIT, signal.SIGHUP, signal.SIGTSTP)
 
 
@@ -86,15 +91,20 @@ class _Stop:
         signal.set_wakeup_fd(outlet, warn_on_full_buffer=False)
         threading.Thread(target=self._read_signals, args=(inlet,), daemon=True).start()
 
+    def ignore_signals(self) -> None:
+        """Ignore repeated signals while Python ends, which would end the process by them."""
+        for number in _SIGNALS:
+            if signal.getsignal(number) is _wake_only:
+                signal.signal(number, signal.SIG_IGN)
+
     def _read_signals(self, inlet: int) -> None:
-        asked = False
+        first = math.inf
         while number := os.read(inlet, 1):
             if signal.getsignal(number[0]) is not _wake_only:  # the node has its own handler
                 continue
-            # A second signal exits at once, except SIGHUP, which a closing terminal sends twice.
-            if asked and number[0] != signal.SIGHUP:
+            first = min(first, time.monotonic())
+            if time.monotonic() - first > REPEATED_SIGNAL_S:
                 os._exit(1)
-            asked = True
             self.request()
 
 
@@ -133,6 +143,7 @@ def run(name: str, make: Callable[[], Node], argv: list[str] | None = None) -> i
         return _fail(name, f"stopped by {type(error).__name__}: {_one_line(str(error))}", 1)
     finally:
         _close(node)
+        stop.ignore_signals()
 
 
 _USAGE_ERRORS = (

@@ -283,6 +283,20 @@ def test_signal_ends_a_node_cleanly_within_two_seconds(process, eventually, numb
     assert "stopped" in node.output
 
 
+def test_repeated_signals_do_not_prevent_the_clean_end_of_a_node(process, eventually):
+    """A terminal, launch and systemd each send one."""
+    node = process(sys.executable, "-c", PROGRAM.format(work="pass"))
+    eventually(lambda: "ready" in node.output, 20.0)
+
+    def signal_until_end() -> bool:
+        node.send_signal(signal.SIGINT)
+        return node.returncode is not None
+
+    eventually(signal_until_end, 2.0)
+    assert node.wait(2.0) == 0
+    assert "stopped" in node.output
+
+
 def test_a_node_that_raises_stops_its_motors_and_reports_the_error(process):
     node = process(sys.executable, "-c", PROGRAM.format(work="raise ValueError('too bad')"))
     assert node.wait(20.0) == 1
