@@ -40,6 +40,7 @@ MIN_GAIN_RATIO = 0.3  # expected gain over that of the best fit; below it a comp
 SEARCH_TOLERANCE = 0.3  # of the deviance, at which a fit of the search ends
 MAX_ADEQUATE_SCATTER = 2.0  # between parts of a record that a chain explains
 MIN_DEVIANCE_DIFFERENCE = 1.0  # between fits at different minima
+MIN_CORRELATION_SIGMAS = 4.0  # at which an autocorrelation differs from zero
 MIN_CERTAIN_SIZE = 20.0  # standard deviations of a component that is kept without a test
 REQUIRED_COMPONENTS = ("friction", "asymmetric_friction")  # components that every motor has
 
@@ -224,12 +225,24 @@ def compute_gain(data: Data, before: Linear, after: Array) -> float:
         if energy <= 0 or not np.isfinite(energy):
             return -math.inf
         gain = new.size * math.log(max(float(old @ old), 1e-300) / energy)
-        factor = 1.0
-        if gain > 0:
-            for lag in range(1, min(40, new.size // 4)):
-                factor += 2 * (float(new[lag:] @ new[:-lag]) / energy) ** 2
-        total += gain / factor
+        total += gain / _compute_variance_inflation(new) if gain > 0 else gain
     return total
+
+
+def _compute_variance_inflation(residual: Array) -> float:
+    """Return the number of rows over that of independent rows with the same information.
+
+    A periodic motion repeats the rounding of its counts, so correlation at any lag counts.
+
+    References
+    ----------
+    G. V. Bayley, J. M. Hammersley, The effective number of independent observations in an
+    autocorrelated time series (1946).
+    """
+    spectrum = np.abs(np.fft.rfft(residual, 2 * residual.size)) ** 2
+    covariance = np.fft.irfft(spectrum)[: residual.size]
+    share = (covariance[1:] / covariance[0]) ** 2
+    return 1.0 + 2.0 * float(share[share > MIN_CORRELATION_SIGMAS**2 / residual.size].sum())
 
 
 def _fit_simplest(data: Data, policy: SelectionPolicy) -> Fit:

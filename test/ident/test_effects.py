@@ -32,6 +32,22 @@ def test_driver_dead_zone_is_found_without_parameter_bias(current):
         assert found.value(name) == pytest.approx(truth[name], rel=2e-3)
 
 
+@pytest.mark.parametrize("resistance, electrical", [(9.34, 1.91e-3), (4.35, 9.5e-3)])
+def test_clean_sine_of_whole_rows_gets_no_effect(resistance, electrical):
+    # 400 rows a period: counts round alike in each, and neighbouring commands are almost equal.
+    t = np.arange(8001) / 200.0
+    voltage = 8.0 * np.sin(2 * np.pi * 0.5 * np.append(0.0, t[:-1]))
+    k, friction = 0.0105, 3.3e-4
+    x = simulate(t, voltage, resistance, resistance * electrical, k, 3.85e-7, 6e-7, friction,
+                 np.zeros(t.size), 2000)  # fmt: skip
+    current = x[:, 0] + 0.002 * np.random.default_rng(1).standard_normal(t.size)
+    count = np.floor(x[:, 2] * 500 / (2 * np.pi)).astype(np.int64)
+    found = estimate(
+        Record("motor", t, voltage, current, count=count, hardware=Hardware(1.0, 500.0))
+    )
+    assert set(found.chain.components) == {"friction", "angle", "electromechanical", "current"}
+
+
 @pytest.mark.parametrize("error", [0.0, 0.003, 0.06])
 def test_once_per_turn_encoder_error_is_estimated(error):
     rng = np.random.default_rng(1)
