@@ -25,7 +25,7 @@ from smp_motor_ident.record import Record
 from smp_motor_ident.simulate.rows import Rows
 
 MIN_SEARCH_ROWS = 4000  # of the search; the chain is then fitted to all rows
-MAX_MERGED_COMMAND_DIFFERENCE = 0.001
+MAX_MERGED_COMMAND_DIFFERENCE = 0.01
 """Difference of commands, over the largest, up to which thinning merges them."""
 
 
@@ -115,11 +115,14 @@ class Data:
         ]
         index = np.concatenate(kept)
         segment = np.concatenate([[0], np.cumsum([k.size for k in kept])])
-        # Sections of about equal command within a row are one, of their mean.
+        # Sections of about equal command are one, of their mean: 1, 1, 2, 4 ... before each row,
+        # so that a current that follows fast keeps the latest command.
+        before = [2**k for k in range((every - 1).bit_length())]
+        ends = np.unique(np.maximum(index[:, None] - [0, *before], 0))
         same = np.zeros(rows.command.size, dtype=np.bool_)
         same[1:] = np.abs(np.diff(rows.command)) <= MAX_MERGED_COMMAND_DIFFERENCE * self.volts
         same[rows.section[:-1]] = False
-        same &= ~np.isin(rows.begin, rows.time[index])
+        same &= ~np.isin(rows.begin, rows.time[ends])
         at = np.flatnonzero(~same)
         section = np.searchsorted(at, rows.section)
         length = np.maximum(np.diff(rows.begin, append=rows.time[-1]), 1e-12)

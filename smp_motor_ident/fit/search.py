@@ -239,8 +239,9 @@ def _compute_variance_inflation(residual: Array) -> float:
     G. V. Bayley, J. M. Hammersley, The effective number of independent observations in an
     autocorrelated time series (1946).
     """
-    spectrum = np.abs(np.fft.rfft(residual, 2 * residual.size)) ** 2
-    covariance = np.fft.irfft(spectrum)[: residual.size]
+    length = 2 ** (2 * residual.size).bit_length()
+    spectrum = np.abs(np.fft.rfft(residual, length)) ** 2
+    covariance = np.fft.irfft(spectrum, length)[: residual.size]
     share = (covariance[1:] / covariance[0]) ** 2
     return 1.0 + 2.0 * float(share[share > MIN_CORRELATION_SIGMAS**2 / residual.size].sum())
 
