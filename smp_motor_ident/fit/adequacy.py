@@ -25,6 +25,7 @@ from smp_motor_ident.fit.descend import Fit
 from smp_motor_ident.fit.start import average_command
 
 BLOCK_COUNT = 24
+MAX_ROUNDING_RATIO = 1.1  # residual over an encoder's rounding up to which it is rounding
 MIN_SIGNIFICANT_EXCESS = 2.0  # standard deviations of a scatter beyond chance
 
 
@@ -36,6 +37,12 @@ class Scatter:
     ratio: float  # of the scatter over that by chance
     significant: bool
     excess: Array  # shape (p, p): covariance of the parameters beyond chance
+
+
+def leaves_only_rounding(data: Data, found: Fit) -> bool:
+    """Tell whether the residual of an angle is the rounding of its counts."""
+    left = float(np.nanstd(data.motion - found.motion))
+    return data.is_angle and left < MAX_ROUNDING_RATIO * data.quantum / math.sqrt(12)
 
 
 def compute_scatters(data: Data, found: Fit) -> list[Scatter]:

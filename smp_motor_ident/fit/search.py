@@ -27,7 +27,7 @@ from smp_motor_ident.chain.chain import Chain, respond
 from smp_motor_ident.chain.component import Component
 from smp_motor_ident.chain.sensor import Angle, DifferencedSpeed, Speed
 from smp_motor_ident.errors import CurrentError, InsufficientExcitationError
-from smp_motor_ident.fit.adequacy import compute_scatters
+from smp_motor_ident.fit.adequacy import compute_scatters, leaves_only_rounding
 from smp_motor_ident.fit.data import Data
 from smp_motor_ident.fit.descend import Fit, approach, descend, fit, fit_noises
 from smp_motor_ident.fit.linear import Linear
@@ -35,7 +35,6 @@ from smp_motor_ident.fit.start import guess_motors
 
 SEARCH_ORDER = 2
 """Order of the noise model during the search; a higher one would absorb missing components."""
-MAX_ROUNDING_RATIO = 1.1  # residual over an encoder's rounding up to which it is rounding
 MIN_GAIN_RATIO = 0.3  # expected gain over that of the best fit; below it a component waits
 SEARCH_TOLERANCE = 0.3  # of the deviance, at which a fit of the search ends
 MAX_ADEQUATE_SCATTER = 2.0  # between parts of a record that a chain explains
@@ -98,10 +97,8 @@ def measure_inadequacy(data: Data, found: Fit) -> float:
 
     An angle that is explained to the resolution of its encoder asks for nothing more.
     """
-    if data.is_angle:
-        left = float(np.nanstd(data.motion - found.motion))
-        if left < MAX_ROUNDING_RATIO * data.quantum / math.sqrt(12):
-            return 1.0
+    if leaves_only_rounding(data, found):
+        return 1.0
     return max((one.ratio for one in compute_scatters(data, found)), default=1.0)
 
 

@@ -15,7 +15,7 @@ from smp_motor_ident.chain.component import Component, Parameter
 from smp_motor_ident.chain.quantities import REPORTED
 from smp_motor_ident.errors import CurrentError, InsufficientExcitationError, SignalError
 from smp_motor_ident.finding import Finding
-from smp_motor_ident.fit.adequacy import Scatter
+from smp_motor_ident.fit.adequacy import Scatter, leaves_only_rounding
 from smp_motor_ident.fit.data import Data, prepare
 from smp_motor_ident.fit.descend import Fit, approach, fit
 from smp_motor_ident.fit.start import guess_motors
@@ -192,6 +192,8 @@ def _check_disagreement(context: EstimateContext) -> Iterator[Finding]:
         for n in ("steady_speed" if context.levels.steady else "dc_gain", "time_constant")
         if (q := context.quantity(n)) is not None
     ) if context.quantity("dc_gain") else 1.0  # fmt: skip
+    if spread <= MAX_NOTE_STD and leaves_only_rounding(context.data, context.found):
+        return  # a periodic motion repeats its rounding
     parts = {"autocorrelation": "stretches of the record", "speed": "slow and fast motion",
              "acceleration": "steady and changing motion"}  # fmt: skip
     yield Finding(

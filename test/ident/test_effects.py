@@ -46,6 +46,7 @@ def test_clean_sine_of_whole_rows_gets_no_effect(resistance, electrical):
         Record("motor", t, voltage, current, count=count, hardware=Hardware(1.0, 500.0))
     )
     assert set(found.chain.components) == {"friction", "angle", "electromechanical", "current"}
+    assert "misfit" not in [f.code for f in found.findings]
 
 
 @pytest.mark.parametrize("error", [0.0, 0.003, 0.06])
