@@ -39,9 +39,9 @@ class Scatter:
     excess: Array  # shape (p, p): covariance of the parameters beyond chance
 
 
-def leaves_only_rounding(data: Data, found: Fit) -> bool:
-    """Tell whether the residual of an angle is the rounding of its counts."""
-    left = float(np.nanstd(data.motion - found.motion))
+def leaves_only_rounding(data: Data, motion: Array) -> bool:
+    """Tell whether a simulated angle leaves only the rounding of the counts."""
+    left = float(np.nanstd(data.motion - motion))
     return data.is_angle and left < MAX_ROUNDING_RATIO * data.quantum / math.sqrt(12)
 
 

@@ -40,6 +40,7 @@ SEARCH_TOLERANCE = 0.3  # of the deviance, at which a fit of the search ends
 MAX_ADEQUATE_SCATTER = 2.0  # between parts of a record that a chain explains
 MIN_DEVIANCE_DIFFERENCE = 1.0  # between fits at different minima
 MIN_CORRELATION_SIGMAS = 4.0  # at which an autocorrelation differs from zero
+MAX_MEMORY_ROWS = 40  # of a residual; a periodic motion repeats its rounding later, too
 MIN_CERTAIN_SIZE = 20.0  # standard deviations of a component that is kept without a test
 REQUIRED_COMPONENTS = ("friction", "asymmetric_friction")  # components that every motor has
 
@@ -97,7 +98,7 @@ def measure_inadequacy(data: Data, found: Fit) -> float:
 
     An angle that is explained to the resolution of its encoder asks for nothing more.
     """
-    if leaves_only_rounding(data, found):
+    if leaves_only_rounding(data, found.motion):
         return 1.0
     return max((one.ratio for one in compute_scatters(data, found)), default=1.0)
 
@@ -222,24 +223,24 @@ def compute_gain(data: Data, before: Linear, after: Array) -> float:
         if energy <= 0 or not np.isfinite(energy):
             return -math.inf
         gain = new.size * math.log(max(float(old @ old), 1e-300) / energy)
-        total += gain / _compute_variance_inflation(new) if gain > 0 else gain
+        if gain > 0:
+            rounding = k == 0 and leaves_only_rounding(data, before.simulated[0])
+            gain /= _compute_variance_inflation(new, new.size if rounding else MAX_MEMORY_ROWS)
+        total += gain
     return total
 
 
-def _compute_variance_inflation(residual: Array) -> float:
+def _compute_variance_inflation(residual: Array, max_lag: int) -> float:
     """Return the number of rows over that of independent rows with the same information.
-
-    A periodic motion repeats the rounding of its counts, so correlation at any lag counts.
 
     References
     ----------
-    G. V. Bayley, J. M. Hammersley, The effective number of independent observations in an
-    autocorrelated time series (1946).
+    G. V. Bayley, J. M. Hammersley, J. R. Statist. Soc. Suppl. 8 (1946), 184.
     """
     length = 2 ** (2 * residual.size).bit_length()
     spectrum = np.abs(np.fft.rfft(residual, length)) ** 2
     covariance = np.fft.irfft(spectrum, length)[: residual.size]
-    share = (covariance[1:] / covariance[0]) ** 2
+    share = (covariance[1:max_lag] / covariance[0]) ** 2
     return 1.0 + 2.0 * float(share[share > MIN_CORRELATION_SIGMAS**2 / residual.size].sum())
 
 

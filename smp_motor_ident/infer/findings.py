@@ -192,7 +192,7 @@ def _check_disagreement(context: EstimateContext) -> Iterator[Finding]:
         for n in ("steady_speed" if context.levels.steady else "dc_gain", "time_constant")
         if (q := context.quantity(n)) is not None
     ) if context.quantity("dc_gain") else 1.0  # fmt: skip
-    if spread <= MAX_NOTE_STD and leaves_only_rounding(context.data, context.found):
+    if spread <= MAX_NOTE_STD and leaves_only_rounding(context.data, context.found.motion):
         return  # a periodic motion repeats its rounding
     parts = {"autocorrelation": "stretches of the record", "speed": "slow and fast motion",
              "acceleration": "steady and changing motion"}  # fmt: skip
