@@ -312,8 +312,8 @@ def _report_levels(context: EstimateContext) -> Iterator[Finding]:
         share = max(shares, default=0.0)
         yield Finding(
             "one_size_of_voltage", "warning",
-            f"all voltages have the size {levels.one_size:.3g} V: gain and time constant are valid "
-            f"there, and the gain may differ by {100 * share:.2g} % at others",
+            f"all swings of the voltage have the size {levels.one_size:.3g} V: gain and time "
+            f"constant are valid there, and the gain may differ by {100 * share:.2g} % at others",
             {"voltage": levels.one_size, "share": share},
             "add levels of other sizes, or record the voltage at the terminals and state its "
             "accuracy",
