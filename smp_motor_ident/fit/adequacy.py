@@ -22,7 +22,6 @@ import numpy as np
 from smp_motor_control.arrays import Array, Integers
 from smp_motor_ident.fit.data import Data
 from smp_motor_ident.fit.descend import Fit
-from smp_motor_ident.fit.start import average_command
 
 BLOCK_COUNT = 24
 MAX_ROUNDING_RATIO = 1.1  # residual over an encoder's rounding up to which it is rounding
@@ -40,9 +39,9 @@ class Scatter:
 
 
 def leaves_only_rounding(data: Data, motion: Array) -> bool:
-    """Tell whether a simulated angle leaves only the rounding of the counts."""
-    left = float(np.nanstd(data.motion - motion))
-    return data.is_angle and left < MAX_ROUNDING_RATIO * data.quantum / math.sqrt(12)
+    """Tell whether a simulated motion leaves only the rounding of counts, or of their difference."""
+    own = data.quantum / math.sqrt(12 if data.is_angle else 6)
+    return float(np.nanstd(data.motion - motion)) < MAX_ROUNDING_RATIO * own
 
 
 def compute_scatters(data: Data, found: Fit) -> list[Scatter]:
@@ -69,7 +68,7 @@ def partition_rows(data: Data, found: Fit) -> Iterator[tuple[str, Integers]]:
     yield "speed", (2 * level + (speed > 0)).astype(np.int64)
     quick = np.abs(np.diff(speed, prepend=speed[0]))
     level = np.searchsorted(np.quantile(quick, [0.2, 0.4, 0.6, 0.8]), quick)
-    command = np.abs(average_command(data.rows))
+    command = np.abs(data.rows.mean_command)
     high = command > np.median(command)
     yield "acceleration", (2 * level + high).astype(np.int64)
 

@@ -40,7 +40,7 @@ SEARCH_TOLERANCE = 0.3  # of the deviance, at which a fit of the search ends
 MAX_ADEQUATE_SCATTER = 2.0  # between parts of a record that a chain explains
 MIN_DEVIANCE_DIFFERENCE = 1.0  # between fits at different minima
 MIN_CORRELATION_SIGMAS = 4.0  # at which an autocorrelation differs from zero
-MAX_MEMORY_ROWS = 40  # of a residual; a periodic motion repeats its rounding later, too
+MAX_MEMORY_ROWS = 40  # of a residual, unless it repeats itself as a periodic command does
 MIN_CERTAIN_SIZE = 20.0  # standard deviations of a component that is kept without a test
 REQUIRED_COMPONENTS = ("friction", "asymmetric_friction")  # components that every motor has
 
@@ -224,8 +224,8 @@ def compute_gain(data: Data, before: Linear, after: Array) -> float:
             return -math.inf
         gain = new.size * math.log(max(float(old @ old), 1e-300) / energy)
         if gain > 0:
-            rounding = k == 0 and leaves_only_rounding(data, before.simulated[0])
-            gain /= _compute_variance_inflation(new, new.size if rounding else MAX_MEMORY_ROWS)
+            max_lag = new.size if data.rows.is_periodic else MAX_MEMORY_ROWS
+            gain /= _compute_variance_inflation(new, max_lag)
         total += gain
     return total
 

@@ -79,7 +79,7 @@ def select_views(data: Data) -> Iterator[Data]:
     begin = rows.begin[int(np.argmax(moves))] if moves.any() else 0.0
     first = max(int(np.searchsorted(rows.time[: rows.segment[1]], begin)) - 5, 0)
     last = min(first + MAX_GRID_ROWS, int(rows.segment[1]))
-    held = average_command(rows)
+    held = rows.mean_command
     yield _replace_rows(data, rows.time[first:last], held[first:last], data.motion[first:last])
     every = -(-len(data) // MAX_GRID_ROWS)
     if every > 1 or rows.segment.size > 2:
@@ -92,16 +92,6 @@ def hold_last_value(values: Array, segment: Integers) -> Array:
     known[segment[:-1]] = True
     last = np.maximum.accumulate(np.where(known, np.arange(values.size), 0))
     return np.asarray(values[last])
-
-
-def average_command(rows: Rows) -> Array:
-    """Return the mean command over the interval that ends at each row [V]."""
-    pieces = rows.pieces(0.0)
-    put = pieces.length * rows.command[pieces.section]
-    total = np.add.reduceat(put, pieces.first[:-1])
-    some = rows.interval > 0
-    last = rows.command[pieces.section[pieces.first[1:] - 1]]
-    return np.where(some, total / np.where(some, rows.interval, 1.0), last)
 
 
 def _replace_rows(

@@ -9,7 +9,6 @@ import numpy as np
 
 from smp_motor_control.arrays import Array
 from smp_motor_ident.fit.data import Data
-from smp_motor_ident.fit.start import average_command
 from smp_motor_ident.limits import LEVEL_TOLERANCE, MAX_REST_VOLTAGE
 
 MIN_SWINGS = 6
@@ -41,7 +40,7 @@ def detect_levels(data: Data) -> Levels:
 
 def _has_coasting(data: Data) -> bool:
     """Tell whether the motor runs down without voltage, which shows its friction."""
-    speed, off = np.abs(data.speed), average_command(data.rows) == 0.0
+    speed, off = np.abs(data.speed), data.rows.mean_command == 0.0
     fast = speed > MIN_COASTING_SPEED_SHARE * float(np.nanquantile(speed, 0.98))
     return int((off & fast).sum()) >= 3
 

@@ -17,7 +17,6 @@ import numpy as np
 from smp_motor_control.arrays import Array
 from smp_motor_ident.fit.data import Data
 from smp_motor_ident.fit.descend import Fit
-from smp_motor_ident.fit.start import average_command
 from smp_motor_ident.infer.unmodelled import estimate_model_error
 from smp_motor_ident.limits import RESIDUAL_LEVEL
 from smp_motor_ident.result import Correlation, ModelError, ResidualTests
@@ -33,7 +32,7 @@ def check_residuals(data: Data, found: Fit) -> ResidualTests:
     """
     error = compute_model_error(data, found)
     e, band = _centre_residual(_place_whitened_residual(data, found))
-    command = average_command(data.rows)
+    command = data.rows.mean_command
     u = (command - command.mean())[:MAX_ROWS]
     if e.std() == 0 or u.std() == 0:
         return ResidualTests(model_error=error)

@@ -14,6 +14,8 @@ from smp_motor_ident._compile import compiled
 MAX_CACHED_CUTS = 4
 MAX_LENGTH_GROUPS = 48  # of pieces whose transitions are tabulated
 LENGTH_TOLERANCE = 1e-9  # relative, of equal lengths
+MIN_PERIOD_LIKENESS = 0.99  # correlation of a command with itself a period later
+MAX_VARIED_LIKENESS = 0.9  # correlation of a command that varies within a period
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,6 +78,29 @@ class Rows:
         """Share of all time that has passed at every row, from 0 to 1."""
         gone = np.cumsum(self.interval)
         return gone / (gone[-1] or 1.0)
+
+    @cached_property
+    def mean_command(self) -> Array:
+        """Mean command over the interval that ends at each row [V]."""
+        pieces = self.pieces(0.0)
+        put = pieces.length * self.command[pieces.section]
+        total = np.add.reduceat(put, pieces.first[:-1])
+        some = self.interval > 0
+        last = self.command[pieces.section[pieces.first[1:] - 1]]
+        return np.where(some, total / np.where(some, self.interval, 1.0), last)
+
+    @cached_property
+    def is_periodic(self) -> bool:
+        """Whether the command varies and repeats itself row by row."""
+        n, u = len(self), self.mean_command
+        lags = np.arange(1, n // 2)
+        length = 2 ** (2 * n).bit_length()
+        product = np.fft.irfft(np.abs(np.fft.rfft(u, length)) ** 2, length)[lags]
+        power = np.cumsum(u**2)
+        norm = np.sqrt(power[n - 1 - lags] * (power[-1] - power[lags - 1]))
+        likeness = product / np.maximum(norm, 1e-300)
+        varies = np.maximum.accumulate(likeness < MAX_VARIED_LIKENESS)
+        return bool((varies & (likeness > MIN_PERIOD_LIKENESS)).any())
 
     def pieces(self, delay: float, longest: float = np.inf, moving: bool = False) -> Pieces:
         """Cut the rows where a command that acts ``delay`` [s] late switches.
