@@ -1,29 +1,102 @@
 # SPDX-License-Identifier: Apache-2.0
 """Read MCAP files, whole or cut off at any byte, and report every loss.
 
-The walk hands out positions for bulk decoding instead of one Python object per message.
+The layout of the records is that of https://mcap.dev/spec.  The walk hands out positions for bulk
+decoding instead of one Python object per message.
 """
 
 import io
+import struct
 import zlib
 from collections import Counter
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
 import numpy as np
+from rosbags.rosbag2.errors import ReaderError
+from rosbags.rosbag2.storage_mcap import read_bytes, read_exact, read_string
 
 from smp_motor_control.arrays import Integers
-from smp_motor_ident.bag.readers import mcap_records as records
 from smp_motor_ident.bag.readers.format import Format, Messages
-from smp_motor_ident.bag.readers.mcap_records import MAGIC
 from smp_motor_ident.bag.storage import Batch, Bytes, Channel, gather, message_type
 from smp_motor_ident.bag.unpack import Budget, decompress
 from smp_motor_ident.errors import BagError
 
 SEQUENCE_KEY = "publication_sequence"
 """Key of a channel's metadata: ``true`` where sequence numbers are the publisher's."""
+MAGIC = b"\x89MCAP0\r\n"
+FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK, CHUNK_INDEX = 2, 3, 4, 5, 6, 8
+STATISTICS, DATA_END = 11, 15
+_LAYOUTS = {
+    SCHEMA: "2ssb",  # number, name, encoding, definition
+    CHANNEL: "22ssm",  # number, schema, topic, encoding, metadata
+    CHUNK: "8884s8",  # first and last time, size and CRC (0: none) unpacked, compression, size
+    CHUNK_INDEX: "8888i8",  # times, start, length, channels, length of the message indices
+    STATISTICS: "82444488i",  # messages, schemas, channels, …, messages by channel
+}
+"""Fields of records: numbers by their bytes, ``s`` a text, ``b`` bytes, ``m`` texts by texts, ``i``
+numbers by channel."""
+_HEAD = struct.Struct("<BQ")  # every record's opcode and length in bytes
+_FOOTER_SIZE = 29  # with its head
+_DAMAGE = (struct.error, ValueError, ReaderError)
 _BLOCK = 1 << 22
+
+
+def _read_fields(op: int, body: bytes) -> list[Any]:
+    """Return a record's fields, and the bytes behind them; one of `_DAMAGE` if it ends early."""
+    file = io.BytesIO(body)
+    readers = {"s": read_string, "b": read_bytes, "m": _read_texts, "i": _read_index}
+    fields = [
+        readers[kind](file)
+        if kind in readers
+        else int.from_bytes(read_exact(file, int(kind)), "little")
+        for kind in _LAYOUTS[op]
+    ]
+    return [*fields, file.read()]
+
+
+def _read_texts(file: BinaryIO) -> dict[str, str]:
+    held = read_bytes(file)
+    pairs, texts = io.BytesIO(held), dict[str, str]()
+    while pairs.tell() < len(held):
+        name = read_string(pairs)
+        texts[name] = read_string(pairs)
+    return texts
+
+
+def _read_index(file: BinaryIO) -> dict[int, int]:
+    return dict(struct.iter_unpack("<HQ", read_bytes(file)))
+
+
+def read_summary(file: BinaryIO) -> dict[int, list[list[Any]]] | None:
+    """Return the fields of the summary's records by opcode.
+
+    None unless it counts the messages and repeats the channels.
+    """
+    end = file.seek(0, io.SEEK_END) - _FOOTER_SIZE - len(MAGIC)
+    if end < len(MAGIC):
+        return None
+    file.seek(end)
+    tail = file.read()
+    at = int.from_bytes(tail[9:17], "little")
+    if tail[0] != FOOTER or not at or not tail.endswith(MAGIC):
+        return None
+    found: dict[int, list[list[Any]]]
+    found = {op: [] for op in (SCHEMA, CHANNEL, CHUNK_INDEX, STATISTICS)}
+    while at < end:
+        file.seek(at)
+        op, length = _HEAD.unpack(file.read(_HEAD.size))
+        at += _HEAD.size + length
+        if at > end:
+            return None
+        if op in found:
+            try:
+                found[op].append(_read_fields(op, file.read(length)))
+            except _DAMAGE:
+                return None
+    statistics, channels = found[STATISTICS], {key for key, *_ in found[CHANNEL]}
+    return found if statistics and statistics[-1][2] == len(channels) else None
 
 
 class _McapFile(Messages):
@@ -31,24 +104,32 @@ class _McapFile(Messages):
 
     def __init__(self, path: Path, name: str, budget: Budget) -> None:
         super().__init__(path, name, budget)
-        self._schemas: dict[int, records.Schema] = {}
+        self._schemas: dict[int, list[Any]] = {}
+        # Messages by channel, from the summary; None without one
+        self._counts: dict[int, int] | None = None
+        # Channels and number of messages of chunks by their start
+        self._chunks: dict[int, tuple[list[int], int]] = {}
         with path.open("rb") as file:
             if file.read(8) != MAGIC:
                 raise BagError(f"{self.name}: does not begin like an MCAP file")
-            self._summary = records.read_summary(file)
-        if self._summary is not None:
+            summary = read_summary(file)
+        if summary is not None:
             self._scanned = True
-            self._schemas.update(self._summary.schemas)
-            for channel in self._summary.channels:
-                self._add_channel(channel)
+            self._counts = summary[STATISTICS][-1][-2]
+            for op in (SCHEMA, CHANNEL):
+                for fields in summary[op]:
+                    self._define(op, fields)
+            for _, _, start, _, offsets, length, _ in summary[CHUNK_INDEX]:
+                # Behind a chunk, each channel's index record is 15 bytes and 16 per message.
+                self._chunks[start] = list(offsets), (length - 15 * len(offsets)) // 16
 
     def declared(self) -> dict[str, int] | None:
         """Return the messages per topic according to the summary."""
-        if self._summary is None:
+        if self._counts is None:
             return None
         counts: Counter[str] = Counter()
         for key, channel in self._channels.items():
-            counts[channel.topic] += self._summary.counts.get(key, 0)
+            counts[channel.topic] += self._counts.get(key, 0)
         return dict(counts)
 
     def batches(self, wanted: Callable[[Channel], bool]) -> Iterator[list[Batch]]:
@@ -60,23 +141,23 @@ class _McapFile(Messages):
                 start = file.tell()
                 head = file.read(9)
                 if len(head) < 9:
-                    if self._summary is None:
+                    if self._counts is None:
                         self._cut(start, "")
                     break
-                op, length = records.HEAD.unpack(head)
-                if op == records.DATA_END:
+                op, length = _HEAD.unpack(head)
+                if op == DATA_END:
                     break
                 whole = start + 9 + length <= size
-                if op == records.CHUNK and not (whole and self._skippable(start, wanted)):
+                if op == CHUNK and not (whole and self._skippable(start, wanted)):
                     body = file.read(min(length, size - start - 9))
                     yield self._chunk(body, start, whole, wanted)
                 elif op == 0 or not whole:
                     if not self._resume(file, start):
                         break
-                elif op == records.MESSAGE:
+                elif op == MESSAGE:
                     yield self._top_level(file, start, length, wanted)
-                elif op in (records.SCHEMA, records.CHANNEL):
-                    self._define(op, file.read(length))
+                elif op in (SCHEMA, CHANNEL):
+                    self._read_definition(op, file.read(length))
                 else:
                     file.seek(length, io.SEEK_CUR)
         self._scanned = True
@@ -96,15 +177,15 @@ class _McapFile(Messages):
     ) -> list[Batch]:
         """Return the messages of a chunk, or the readable ones of a chunk that is cut off."""
         try:
-            size, crc, compression, packed = records.read_chunk(body)
-        except records.DAMAGE:
+            _, _, size, crc, compression, stored, rest = _read_fields(CHUNK, body)
+        except _DAMAGE:
             self._cut(start, "inside a chunk's head")
             return []
-        data = decompress(packed, compression, self._budget)
+        data = decompress(rest[:stored], compression, self._budget)
         sound = len(data) == size and (not crc or zlib.crc32(data) == crc)
         if whole and not sound:
-            index = self._chunks.get(start)
-            many = f" with {index.messages} messages" if index and index.channels else ""
+            channels, messages = self._chunks.get(start, ([], 0))
+            many = f" with {messages} messages" if channels else ""
             self._damage(f"the chunk at byte {start} is damaged and was left out{many}")
             return []
         positions, end = self._walk(data)
@@ -119,18 +200,18 @@ class _McapFile(Messages):
 
     def _walk(self, data: bytes) -> tuple[list[int], int]:
         """Read definitions; return where messages begin and where the last whole record ends."""
-        unpack, end, pos = records.HEAD.unpack_from, len(data), 0
+        unpack, end, pos = _HEAD.unpack_from, len(data), 0
         messages: list[int] = []
         while end - pos >= 9:
             op, length = unpack(data, pos)
             following = pos + 9 + length
             if following > end:
                 break
-            if op == records.MESSAGE:
+            if op == MESSAGE:
                 messages.append(pos)
-            elif op in (records.SCHEMA, records.CHANNEL):
-                self._define(op, data[pos + 9 : following])
-            elif op in (0, records.CHUNK, records.DATA_END):
+            elif op in (SCHEMA, CHANNEL):
+                self._read_definition(op, data[pos + 9 : following])
+            elif op in (0, CHUNK, DATA_END):
                 break
             pos = following
         return messages, pos
@@ -166,34 +247,33 @@ class _McapFile(Messages):
                 batches.append(Batch(channel, raw, mine + 31, length[which], log_time, sequence))
         return batches
 
-    def _define(self, op: int, body: bytes) -> None:
+    def _read_definition(self, op: int, body: bytes) -> None:
         """Store a schema or a channel; a damaged one is reported by its messages."""
         try:
-            if op == records.SCHEMA:
-                schema = records.read_schema(body)
-                self._schemas[schema.id] = schema
-            else:
-                self._add_channel(records.read_channel(body))
-        except records.DAMAGE:
+            self._define(op, _read_fields(op, body))
+        except _DAMAGE:
             return
 
-    def _add_channel(self, channel: records.Channel) -> None:
-        schema = self._schemas.get(channel.schema)
-        self._channels[channel.id] = Channel(
-            id=channel.id,
-            topic=channel.topic,
-            type=message_type(schema.name) if schema else "",
-            encoding=channel.encoding,
-            definition=schema.data.decode("utf-8", "replace") if schema else "",
-            definition_format=schema.encoding if schema else "",
-            qos=channel.metadata.get("offered_qos_profiles", ""),
-            numbered=channel.metadata.get(SEQUENCE_KEY) == "true",
+    def _define(self, op: int, fields: list[Any]) -> None:
+        if op == SCHEMA:
+            self._schemas[fields[0]] = fields
+            return
+        key, schema, topic, encoding, metadata, _ = fields
+        _, kind, form, text, _ = self._schemas.get(schema, (0, "", "", b"", b""))
+        self._channels[key] = Channel(
+            id=key,
+            topic=topic,
+            type=message_type(kind),
+            encoding=encoding,
+            definition=text.decode("utf-8", "replace"),
+            definition_format=form,
+            qos=metadata.get("offered_qos_profiles", ""),
+            numbered=metadata.get(SEQUENCE_KEY) == "true",
         )
 
     def _skippable(self, start: int, wanted: Callable[[Channel], bool]) -> bool:
         """Return whether a chunk has no wanted message according to the index."""
-        index = self._chunks.get(start)
-        inside = [self._channels.get(key) for key in index.channels] if index else []
+        inside = [self._channels.get(key) for key in self._chunks.get(start, ([], 0))[0]]
         return bool(inside) and all(c is not None and not wanted(c) for c in inside)
 
     def _resume(self, file: BinaryIO, start: int) -> bool:
@@ -204,13 +284,9 @@ class _McapFile(Messages):
             file.seek(min(beyond))
         return bool(beyond)
 
-    @property
-    def _chunks(self) -> dict[int, records.ChunkIndex]:
-        return {} if self._summary is None else self._summary.chunks
-
     def _cut(self, start: int, where: str) -> None:
         size = self.path.stat().st_size
-        what = "damaged" if self._summary is not None else "cut off or damaged"
+        what = "damaged" if self._counts is not None else "cut off or damaged"
         self._damage(f"{what} at byte {start} of {size} {where}".rstrip())
 
 
