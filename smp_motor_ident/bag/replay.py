@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Yield a bag's messages one by one in order of arrival, for a player."""
 
-import heapq
+import math
+from bisect import bisect_right
 from collections.abc import Callable, Iterator
-from itertools import count
+from operator import itemgetter
 from pathlib import Path
 
 import yaml
@@ -13,7 +14,7 @@ from smp_motor_ident.bag.storage import Batch, Channel
 from smp_motor_ident.bag.unpack import decompress_messages
 from smp_motor_ident.errors import BagError
 
-Entry = tuple[int, int, Batch, int]
+Entry = tuple[int, Batch, int]
 
 
 class Replay:
@@ -39,29 +40,21 @@ class Replay:
         Where chunks overlap by more than one, a late message comes late.
         """
 
-        def message(entry: Entry) -> tuple[Channel, int, bytes]:
-            time, _, batch, k = entry
-            return batch.channel, time, batch.message(k)
-
         waiting: list[Entry] = []
-        number = count()
         self._recording.findings.clear()
         for together in self._recording.batches(wanted):
-            fresh: list[Entry] = []
-            for packed in together:
-                batch, _ = decompress_messages(packed, self._recording.budget)
-                fresh += [
-                    (t, next(number), batch, k) for k, t in enumerate(batch.log_time.tolist())
-                ]
-            if not fresh:
-                continue
-            begin = min(entry[0] for entry in fresh)
-            while waiting and waiting[0][0] <= begin:
-                yield message(heapq.heappop(waiting))
-            waiting += fresh
-            heapq.heapify(waiting)
-        while waiting:
-            yield message(heapq.heappop(waiting))
+            plain = [decompress_messages(packed, self._recording.budget)[0] for packed in together]
+            fresh = [(t, batch, k) for batch in plain for k, t in enumerate(batch.log_time.tolist())]
+            begin = min((time for time, _, _ in fresh), default=-math.inf)
+            due = bisect_right(waiting, begin, key=itemgetter(0))
+            yield from map(_read_message, waiting[:due])
+            waiting = sorted(waiting[due:] + fresh, key=itemgetter(0))
+        yield from map(_read_message, waiting)
+
+
+def _read_message(entry: Entry) -> tuple[Channel, int, bytes]:
+    time, batch, k = entry
+    return batch.channel, time, batch.message(k)
 
 
 def find_offered_qos(channel: Channel) -> tuple[bool, bool]:

@@ -127,29 +127,23 @@ class _SqliteFile(Messages):
     def _read_blocks(self, asked: dict[int, Channel]) -> Iterator[tuple[int, list[Batch]]]:
         """Yield the number of the last row, and a block of rows by topic."""
         ids = ",".join(str(key) for key in asked)
-        among = "" if len(asked) == len(self._topics) else f"AND topic_id IN ({ids}) "
-        query = (
-            "SELECT id, topic_id, timestamp, data FROM messages "
-            f"WHERE id > ? {among}ORDER BY id LIMIT {_MAX_BLOCK_ROWS}"
-        )
-        last = _NO_ID
-        while rows := self._read_rows(query, last):
-            last = rows[-1][0]
-            yield last, self._split(rows, asked)
-
-    def _read_rows(self, query: str, last: int) -> list[tuple[int, int, int, bytes]]:
-        """Return the next rows; damaged pages may give the same bytes to many of them."""
-        rows, size = [], 0
-        for row in self._database.execute(query, (last,)):
-            if not isinstance(row[0], int) or row[0] <= last:  # avoid an endless loop
+        among = "" if len(asked) == len(self._topics) else f"WHERE topic_id IN ({ids}) "
+        query = f"SELECT id, topic_id, timestamp, data FROM messages {among}ORDER BY id"
+        rows: list[tuple[int, int, int, bytes]] = []
+        last, size = _NO_ID, 0
+        for row in self._database.execute(query):
+            if not isinstance(row[0], int) or row[0] <= last:  # damaged pages may repeat rows
                 raise sqlite3.DatabaseError("its rows are out of order")
             last = row[0]
             rows.append(row)
-            size += len(row[3]) if isinstance(row[3], (bytes, str)) else 0
-            if size > _MAX_BLOCK_BYTES:
-                break
-        self._budget.take(size + _MIN_ROW_BYTES * len(rows))
-        return rows
+            size += _MIN_ROW_BYTES + (len(row[3]) if isinstance(row[3], (bytes, str)) else 0)
+            if size > _MAX_BLOCK_BYTES or len(rows) == _MAX_BLOCK_ROWS:
+                self._budget.take(size)
+                yield last, self._split(rows, asked)
+                rows, size = [], 0
+        self._budget.take(size)
+        if rows:
+            yield last, self._split(rows, asked)
 
     def _split(
         self, rows: list[tuple[int, int, int, bytes]], asked: dict[int, Channel]
