@@ -2,7 +2,7 @@
 """Resample all signals of a motor to its main output's times; split at gaps."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from typing import Any
 
@@ -105,56 +105,50 @@ def resample(motor: Context, series: dict[str, Series], axis_name: str) -> Recor
         raise BagError(
             f"{motor.where}: no speed, position or count has a finite value; map another field"
         )
-    columns["voltage"] = values
-    if not motor.plan.own:
-        axis, columns, starts = _undo_delay(motor, axis, columns, starts)
-    axis, columns, starts = _drop_single_samples(motor, axis, columns, starts)
-    if axis.size < 2:
-        raise BagError(f"{motor.where}: fewer than 2 samples in a row are left")
-    return Record(
+    record = Record(
         wheel=motor.wheel,
         time=(axis - axis[0]) * 1e-9,
+        voltage=values,
         starts=tuple(np.flatnonzero(starts).tolist()),
         hardware=motor.hardware,
         source=motor.source,
-        findings=tuple(f for k, f in enumerate(motor.findings) if f not in motor.findings[:k]),
         velocity_window=motor.plan.velocity_window,
         recorded=find_first_time(motor.tables[topic].logged for topic in motor.plan.topics),
         **columns,
     )
+    record = record if motor.plan.own else _undo_delay(motor, record)
+    record = _drop_single_samples(motor, record)
+    findings = tuple(f for k, f in enumerate(motor.findings) if f not in motor.findings[:k])
+    return replace(record, time=record.time - record.time[0], findings=findings)
 
 
-def _undo_delay(
-    motor: Context, axis: Integers, columns: dict[str, Any], starts: Flags
-) -> tuple[Integers, dict[str, Any], Flags]:
+def _undo_delay(motor: Context, record: Record) -> Record:
     """Shift a voltage that is recorded several rows late."""
-    edges = np.append(np.flatnonzero(starts), axis.size)
+    edges = (*record.starts, len(record))
     longest = int(np.argmax(np.diff(edges)))
     part = slice(edges[longest], min(edges[longest + 1], edges[longest] + MAX_TESTED_ROWS))
-    name, motion = next((n, v[part]) for n in MOTIONS if (v := columns.get(n)) is not None)
-    if not measure_sampling(axis[part]).regular or not np.isfinite(motion).all():
-        return axis, columns, starts
+    name, motion = next((n, v[part]) for n in MOTIONS if (v := getattr(record, n)) is not None)
+    sampling = measure_sampling(record.time[part])
+    if not sampling.regular or not np.isfinite(motion).all():
+        return record
     if name != "velocity":
         motion = np.diff(motion, prepend=motion[:1])
-    rows = find_late_rows(columns["voltage"][part], motion.astype(np.float64))
+    rows = find_late_rows(record.voltage[part], motion.astype(np.float64))
     if rows < MIN_SHIFT_ROWS:
-        return axis, columns, starts
-    late = rows * measure_sampling(axis[part]).interval * 1e-9
+        return record
+    late = rows * sampling.interval
     text = (
         f"the voltage is recorded {1e3 * late:.3g} ms ({rows} rows) after it acts, or the motion "
         "was smoothed in both directions; the voltage was moved back"
     )
     motor.report("voltage_late", text, "warning", rows=rows, late=late)
-    keep = np.concatenate([np.arange(a, b) < b - rows for a, b in pairwise(edges)])
-    if not keep.any():
+    kept = np.concatenate([np.arange(a, b - rows) for a, b in pairwise(edges)])
+    if kept.size < 2:
         raise BagError(
             f"{motor.where}: the voltage is recorded {rows} rows late, and no segment is longer; "
             "record longer ones"
         )
-    voltage = np.roll(columns["voltage"], -rows)
-    kept = {n: None if v is None else v[keep] for n, v in {**columns, "voltage": voltage}.items()}
-    begun = np.cumsum(starts)[keep]
-    return axis[keep], kept, np.concatenate([[True], np.diff(begun) > 0])
+    return replace(record, voltage=np.roll(record.voltage, -rows)).take(kept)
 
 
 def _detect_hold(motor: Context, voltage: Series, output: Series, name: str, starts: Flags) -> str:
@@ -319,16 +313,15 @@ def _interpolate(
     return values
 
 
-def _drop_single_samples(
-    motor: Context, axis: Integers, columns: dict[str, Any], starts: Flags
-) -> tuple[Integers, dict[str, Any], Flags]:
+def _drop_single_samples(motor: Context, record: Record) -> Record:
     """Leave out segments of a single sample."""
-    edges = np.append(np.flatnonzero(starts), axis.size)
-    short = np.diff(edges) < 2
+    lengths = np.diff([*record.starts, len(record)])
+    short = lengths < 2
     if not short.any():
-        return axis, columns, starts
-    keep = np.repeat(~short, np.diff(edges))
+        return record
     text = f"{int(short.sum())} single samples between gaps were left out"
     motor.report("single_samples", text)
-    kept = {name: None if v is None else v[keep] for name, v in columns.items()}
-    return axis[keep], kept, starts[keep]
+    kept = np.flatnonzero(np.repeat(~short, lengths))
+    if not kept.size:
+        raise BagError(f"{motor.where}: fewer than 2 samples in a row are left")
+    return record.take(kept)

@@ -133,7 +133,7 @@ def split_at_resets(time: Integers) -> Parts:
 class Sampling:
     """Regularity of a sampling interval."""
 
-    interval: float  # median interval [ns]
+    interval: float  # median interval, in the unit of the times
     regular: bool  # whether four of five intervals are within a quarter of it
 
     def missing(self, time: Integers) -> Integers:
@@ -166,7 +166,7 @@ class Sampling:
         return max(100 * self.interval, 1.0 * _SECOND_NS)
 
 
-def measure_sampling(time: Integers) -> Sampling:
+def measure_sampling(time: Integers | Array) -> Sampling:
     """Return the regularity of sampling."""
     if time.size < 2:
         return Sampling(0.0, False)

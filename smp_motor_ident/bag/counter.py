@@ -54,10 +54,9 @@ def find_wrap(value: Array) -> Wrap | None:
     usual = np.delete(np.abs(steps), jumps)
     if jumps.size < _MIN_WRAPS or not usual.size or usual.max() > span / 4:
         return None
-    small = steps.copy()
-    small[jumps] = np.nan
-    before = np.stack([_take_or_nan(small, jumps - k) for k in (1, 2, 3)])
-    after = np.stack([_take_or_nan(small, jumps + k) for k in (1, 2, 3)])
+    small = np.pad(steps, 3, constant_values=np.nan)
+    small[jumps + 3] = np.nan
+    before, after = (np.stack([small[jumps + 3 + k * way] for k in (1, 2, 3)]) for way in (-1, 1))
     seen = np.isfinite(before).any(axis=0) & np.isfinite(after).any(axis=0)
     jump = steps[jumps[seen]]
     if jump.size < _MIN_WRAPS:
@@ -95,11 +94,6 @@ def undo_wraps(value: Array, width: float) -> Array:
     steps = np.diff(value)
     whole = steps - width * np.rint(steps / width)
     return np.concatenate([value[:1], value[:1] + np.cumsum(whole)])
-
-
-def _take_or_nan(value: Array, index: Integers) -> Array:
-    inside = (index >= 0) & (index < value.size)
-    return np.where(inside, value[np.clip(index, 0, value.size - 1)], np.nan)
 
 
 @dataclass(frozen=True, eq=False)

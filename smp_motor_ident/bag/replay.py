@@ -44,7 +44,9 @@ class Replay:
         self._recording.findings.clear()
         for together in self._recording.batches(wanted):
             plain = [decompress_messages(packed, self._recording.budget)[0] for packed in together]
-            fresh = [(t, batch, k) for batch in plain for k, t in enumerate(batch.log_time.tolist())]
+            fresh = [
+                (t, batch, k) for batch in plain for k, t in enumerate(batch.log_time.tolist())
+            ]
             begin = min((time for time, _, _ in fresh), default=-math.inf)
             due = bisect_right(waiting, begin, key=itemgetter(0))
             yield from map(_read_message, waiting[:due])

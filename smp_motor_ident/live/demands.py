@@ -1,9 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """Check whether the recent samples of a running motor suffice for identification."""
 
+from dataclasses import replace
+
 import numpy as np
 
 from smp_motor_control.arrays import Array
+from smp_motor_ident.quality.screen import measured_speed
 from smp_motor_ident.record import Record
 
 MIN_DURATION_S, MIN_MOTION_S = 5.0, 3.0  # least length of a window, and time of motion in it
@@ -18,7 +21,9 @@ def find_missing_excitation(record: Record | None) -> list[str]:
     """Return descriptions of missing excitation; empty if an estimate is possible."""
     if record is None:
         return ["no motor_state yet"]
-    voltage, speed = record.voltage, _speed(record)
+    hardware = record.hardware  # the unit of the speed does not matter
+    hardware = replace(hardware, counts_per_revolution=hardware.counts_per_revolution or 1.0)
+    voltage, speed = record.voltage, measured_speed(replace(record, hardware=hardware))
     step = record.sample_time
     threshold = 0.02 * max(float(np.nanmax(np.abs(speed))), 1e-9)
     forward, backward = float(np.mean(speed > threshold)), float(np.mean(speed < -threshold))
@@ -47,14 +52,3 @@ def _shares(voltage: Array) -> Array:
         return np.ones(1)
     level = np.minimum((voltage - low) / span * LEVELS, LEVELS - 1).astype(np.int64)
     return np.bincount(level, minlength=LEVELS) / voltage.size
-
-
-def _speed(record: Record) -> Array:
-    """Return the speed in an arbitrary unit, from counts if they are known."""
-    counts = record.count if record.hardware.counts_per_revolution else None
-    if counts is None and record.velocity is not None:
-        return record.velocity
-    turned = counts if counts is not None else record.position
-    turned = record.count if turned is None else turned
-    assert turned is not None  # a record has one of the three
-    return np.asarray(np.gradient(turned.astype(np.float64), record.time))

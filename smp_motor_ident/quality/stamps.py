@@ -88,7 +88,7 @@ def _fit_beat(arrival: Integers) -> tuple[Array, float, float] | None:
     if 4 * window > since.size:
         return None
     number = np.arange(since.size, dtype=np.float64)
-    begins = _divide_evenly(since.size, since.size // window)[:-1]
+    begins = [part[0] for part in np.array_split(np.arange(since.size), since.size // window)]
     for lost in (0, 1):
         if lost:
             number += _count_lost(since, number, window)
@@ -103,13 +103,6 @@ def _fit_beat(arrival: Integers) -> tuple[Array, float, float] | None:
     return None
 
 
-def _divide_evenly(size: int, count: int) -> Integers:
-    """Return where so many parts of about equal length begin, and the end of the last."""
-    part = np.arange(count + 1)
-    edges: Integers = part * (size // count) + np.minimum(part, size % count)
-    return edges
-
-
 def _compute_period_std(number: Array, since: Array) -> float:
     """Return the standard deviation of the period, by a jackknife that deletes blocks."""
     parts = np.array_split(np.arange(number.size), JACKKNIFE_BLOCKS)
@@ -119,8 +112,8 @@ def _compute_period_std(number: Array, since: Array) -> float:
 
 def _count_lost(since: Array, number: Array, window: int) -> Array:
     """Return the number of samples lost up to each: a loss raises the floor by whole periods."""
-    edges = _divide_evenly(since.size, since.size // (2 * window))
-    parts = [slice(*ends) for ends in pairwise(edges)][:: max((edges.size - 1) // 200, 1)]
+    parts = np.array_split(np.arange(since.size), since.size // (2 * window))
+    parts = parts[:: max(len(parts) // 200, 1)]
     period = float(np.median([_fit_line(number[p], since[p])[1] for p in parts]))
     lost = np.zeros(since.size)
     if period <= 0:
