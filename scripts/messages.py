@@ -25,7 +25,9 @@ def read_text(node: ast.expr) -> str:
         return node.value
     if isinstance(node, ast.FormattedValue):
         form = ast.unparse(node.format_spec) if node.format_spec else ""
-        return "N%" if form.endswith("%'") else "N" if form.endswith(("g'", "f'")) else "…"
+        formatted = ast.unparse(node.value).startswith("format_figure")
+        number = formatted or form.endswith(("g'", "f'"))
+        return "N%" if form.endswith("%'") else "N" if number else "…"
     return "".join(map(read_text, node.values)) if isinstance(node, ast.JoinedStr) else ""
 
 

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Literal
@@ -43,3 +44,18 @@ class Finding:
 def gravest(findings: Iterable[Finding]) -> Severity | None:
     """Return the gravest severity among findings, None without findings."""
     return max((f.severity for f in findings), key=SEVERITIES.index, default=None)
+
+
+def format_figure(value: float, digits: int = 3) -> str:
+    """Return a number with so many digits; a power of ten below 1e-4 and from a million on."""
+    if math.isinf(value):
+        return "∞"
+    if 10.0 ** (digits - 1) <= abs(value) < 1e6:
+        return f"{value:.0f}"
+    number, _, power = f"{value:.{digits}g}".partition("e")
+    return f"{number}{format_power(int(power))}" if power else number
+
+
+def format_power(power: int) -> str:
+    """Return a power of ten as a factor in print: ``·10⁻⁶``."""
+    return "·10" + str(power).translate(str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹"))

@@ -14,7 +14,7 @@ from smp_motor_ident import limits
 from smp_motor_ident.chain.component import Component, Parameter
 from smp_motor_ident.chain.quantities import REPORTED
 from smp_motor_ident.errors import CurrentError, InsufficientExcitationError, SignalError
-from smp_motor_ident.finding import Finding
+from smp_motor_ident.finding import Finding, format_figure
 from smp_motor_ident.fit.adequacy import Scatter, leaves_only_rounding
 from smp_motor_ident.fit.data import Data, prepare
 from smp_motor_ident.fit.descend import Fit, approach, fit
@@ -108,8 +108,8 @@ def refuse_unexplained(context: EstimateContext) -> None:
         largest = float(np.nanmax(np.abs(context.data.current)))
         if offset > limits.MAX_CURRENT_OFFSET * max(largest - offset, 1e-12):
             raise CurrentError(
-                f"{where}: current has an offset of {offset:.3g} A where it reaches "
-                f"{largest:.3g} A; zero the current sensor at rest and record again"
+                f"{where}: current has an offset of {format_figure(offset)} A where it reaches "
+                f"{format_figure(largest)} A; zero the current sensor at rest and record again"
             )
     if context.quantity("dc_gain") is None and context.quantity("steady_speed") is None:
         _refuse_angle(where, context.group)
@@ -214,7 +214,8 @@ def _check_time_constant(context: EstimateContext) -> Iterator[Finding]:
     quick = high < context.data.rows.step
     yield Finding(
         "lag_unknown", "warning" if quick else "unreliable",
-        f"the time constant is only known to lie between {low:.3g} and {high:.3g} s",
+        f"the time constant is only known to lie between {format_figure(low)} and "
+        f"{format_figure(high)} s",
         {"low": low, "high": high, "sample_time": context.data.rows.step},
         "sample faster" if quick else
         "record longer, with several frequencies, in both directions and well above friction",
@@ -290,7 +291,7 @@ def _describe_size(context: EstimateContext, parameter: Parameter) -> str:
         value = context.found.chain.values[name]
         std = math.sqrt(max(sum(float(p.covariance[k, k]) for p in context.parts), 0.0))
     shown = "" if unit == "1" else f" {unit}"
-    return f"{name.replace('_', ' ')} {value:.3g} ± {std:.2g}{shown}"
+    return f"{name.replace('_', ' ')} {format_figure(value)} ± {format_figure(std, 2)}{shown}"
 
 
 def _report_levels(context: EstimateContext) -> Iterator[Finding]:
@@ -343,7 +344,7 @@ def _report_driving_load(context: EstimateContext) -> Iterator[Finding]:
         yield Finding(
             "driving_load", "unreliable",
             "the steady speed is higher than the response to changes of the voltage explains: "
-            f"a load of {abs(load.value):.3g} V seems to drive the motor",
+            f"a load of {format_figure(abs(load.value))} V seems to drive the motor",
             {"load_voltage": load.value},
             "drive both directions, or record the voltage at the terminals",
         )  # fmt: skip
@@ -360,7 +361,8 @@ def _report_current_offset(context: EstimateContext) -> Iterator[Finding]:
     if abs(offset) > max(4 * std, 0.01 * float(np.nanmax(np.abs(current)))):
         yield Finding(
             "current_offset", "note",
-            f"the current has an offset of {offset:.3g} ± {std:.1g} A, which was subtracted",
+            f"the current has an offset of {format_figure(offset)} ± {format_figure(std, 1)} A, "
+            "which was subtracted",
             {"offset": offset}, "zero the current sensor at rest",
         )  # fmt: skip
 
@@ -411,8 +413,8 @@ def _report_torque_noise(context: EstimateContext) -> Iterator[Finding]:
         return
     yield Finding(
         "torque_noise", "note",
-        f"the load fluctuates: the acceleration scatters by {acceleration:.3g} rad/s^2 over a "
-        "second, which limits the accuracy",
+        f"the load fluctuates: the acceleration scatters by {format_figure(acceleration)} rad/s^2 "
+        "over a second, which limits the accuracy",
         {"acceleration": acceleration},
         "hold the load constant, or record longer",
     )  # fmt: skip

@@ -8,7 +8,7 @@ import numpy as np
 from smp_motor_control.arrays import Array
 from smp_motor_ident import limits
 from smp_motor_ident.errors import CurrentError, InsufficientExcitationError, SignalError
-from smp_motor_ident.finding import Finding
+from smp_motor_ident.finding import Finding, format_figure
 from smp_motor_ident.quality.edge_timer import read_held_share
 from smp_motor_ident.quality.glitches import count_glitches
 from smp_motor_ident.quality.saturation import refuse_saturation
@@ -24,7 +24,7 @@ from smp_motor_ident.record import Record
 
 def screen_records(records: Sequence[Record]) -> list[Finding]:
     """Refuse records without a valid estimate; name the reason and the remedy."""
-    warnings = check_voltage(records)
+    warnings = [*check_voltage(records)]
     where = name_records(records)
     refuse_mixed_time_units(records)
     _check_length(records, where)
@@ -105,8 +105,8 @@ def _check_excitation(records: Sequence[Record], where: str) -> None:
     supply = max(r.hardware.supply_voltage or 0.0 for r in records)
     if largest <= limits.VOLTMETER_SCATTER * supply:
         raise InsufficientExcitationError(
-            f"{where}: no excitation, the voltage stays within {largest:.3g} V of 0 V; drive the "
-            "motor with a sine, square or Fourier voltage while recording"
+            f"{where}: no excitation, the voltage stays within {format_figure(largest)} V of 0 V; "
+            "drive the motor with a sine, square or Fourier voltage while recording"
         )
     # A voltmeter's scatter around a level is not an excitation; a step is one.
     levels = [float(np.mean(r.voltage)) for r in records]

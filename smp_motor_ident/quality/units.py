@@ -57,27 +57,24 @@ def refuse_mixed_time_units(records: Sequence[Record]) -> None:
                 )
 
 
-def check_voltage(records: Sequence[Record]) -> list[Finding]:
-    """Return findings on voltages beyond those of robots, especially whole numbers.
+def check_voltage(records: Sequence[Record]) -> Iterator[Finding]:
+    """Report voltages beyond those of robots, especially whole numbers.
 
     The mean of two whole numbers over an interval is a whole or half number.
     """
     largest = max(float(np.nanmax(np.abs(r.voltage))) for r in records)
     if largest <= EXTRA_LOW_VOLTAGE:
-        return []
+        return
     whole = all(np.array_equal(2 * r.voltage, np.rint(2 * r.voltage)) for r in records)
-    return [
-        Finding(
-            "whole_volts" if whole else "high_voltage",
-            "unreliable" if whole or largest > LOW_VOLTAGE else "warning",
-            f"the voltage {'is whole numbers' if whole else 'goes'} up to {largest:.4g}: it may be "
-            "the counts of a PWM, percent or millivolts; gain and static voltage then have this "
-            "unit",
-            {"largest": largest},
-            "map it as voltage=COLUMN:pwm with pwm_full_scale and supply_voltage (or :% of it), "
-            "or with its unit, such as voltage=COLUMN:mV",
-        )
-    ]
+    yield Finding(
+        "whole_volts" if whole else "high_voltage",
+        "unreliable" if whole or largest > LOW_VOLTAGE else "warning",
+        f"the voltage {'is whole numbers' if whole else 'goes'} up to {largest:.4g}: it may be the "
+        "counts of a PWM, percent or millivolts; gain and static voltage then have this unit",
+        {"largest": largest},
+        "map it as voltage=COLUMN:pwm with pwm_full_scale and supply_voltage (or :% of it), or "
+        "with its unit, such as voltage=COLUMN:mV",
+    )
 
 
 def check_plausibility(

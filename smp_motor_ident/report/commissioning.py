@@ -9,7 +9,7 @@ from functools import partial
 from itertools import groupby
 from typing import TYPE_CHECKING, Any
 
-from smp_motor_ident.finding import SEVERITIES
+from smp_motor_ident.finding import SEVERITIES, format_figure
 from smp_motor_ident.report import words
 from smp_motor_ident.report.drawing import Chart, Curve, resample
 from smp_motor_ident.report.templates import page
@@ -116,7 +116,7 @@ def _list_drive_rows(
 
 
 def _format_figure(scale: float, value: float | None) -> str:
-    return "—" if value is None else words.format_figure(round(scale * value, 2))
+    return "—" if value is None else format_figure(round(scale * value, 2))
 
 
 def charts(changes: Sequence[Change]) -> list[Chart]:

@@ -7,11 +7,13 @@ The page computes nothing; its sliders choose among these designs.
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
 
 from smp_motor_ident.errors import SmpError
+from smp_motor_ident.finding import format_figure
 from smp_motor_ident.report import drawing, words
 from smp_motor_ident.report.drawing import Chart, Curve, resample
 from smp_motor_ident.result import Estimate
@@ -95,13 +97,8 @@ def design_tuning(estimate: Estimate, loop: Loop, own: Design) -> Tuning:
         for margin in PHASE_MARGINS
         for share in BANDWIDTH_SHARES
     ]
-    return Tuning(
-        estimate.wheel,
-        choices,
-        PHASE_MARGINS.index(DEFAULT_PHASE_MARGIN) * len(BANDWIDTH_SHARES)
-        + len(BANDWIDTH_SHARES)
-        - 1,
-    )
+    chosen = next(k for k, one in enumerate(choices) if one.design is own)
+    return Tuning(estimate.wheel, choices, chosen)
 
 
 def choose(estimate: Estimate, loop: Loop, bandwidth: float, margin: float, own: Design) -> Choice:
@@ -112,10 +109,7 @@ def choose(estimate: Estimate, loop: Loop, bandwidth: float, margin: float, own:
 
 def judge(estimate: Estimate, own: Design, feedback: Feedback) -> Choice:
     """Return the figures of gains set by hand, with the reference of ``own``."""
-
-    def given(case: Case) -> tuple[Feedback, float, Robustness]:
-        return assess(case, feedback)
-
+    given = partial(assess, feedback=feedback)
     return _finish_choice(estimate, own.loop, Choice(math.nan, math.nan), own, {}, given)
 
 
@@ -184,7 +178,7 @@ def _list_figures(found: Design) -> list[tuple[str, str, str]]:
     """Return name, value and band of the design's figures."""
     bands, gains, settling = found.specification, found.gains, found.settling
     abrupt, noise = (
-        words.format_figure(1e3 * x) for x in (settling.abrupt, found.performance.control_noise)
+        format_figure(1e3 * x) for x in (settling.abrupt, found.performance.control_noise)
     )
     return [
         ("Crossover", f"{found.margins.crossover:.4g} rad/s", ""),
@@ -196,7 +190,7 @@ def _list_figures(found: Design) -> list[tuple[str, str, str]]:
         (
             f"Duration of a planned change by {settling.change:.3g} rad/s"
             f"{', the same for all wheels' if settling.common else ''}",
-            f"{words.format_figure(1e3 * settling.transition)} ms",
+            f"{format_figure(1e3 * settling.transition)} ms",
             "",
         ),
         ("Settling of an abrupt change, feedback alone", f"{abrupt} ms", ""),
@@ -209,7 +203,7 @@ def _list_figures(found: Design) -> list[tuple[str, str, str]]:
 
 def _format_band(band: specification.Band, scale: float, unit: str) -> tuple[str, str]:
     value, low, high = (
-        words.format_figure(round(scale * v, 3)) for v in (band.value, band.low, band.high)
+        format_figure(round(scale * v, 3)) for v in (band.value, band.low, band.high)
     )
     return f"{value}{unit}", f"{low} … {high}{unit}"
 

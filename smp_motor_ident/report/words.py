@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from datetime import datetime, timezone
 
+from smp_motor_ident.finding import format_figure, format_power
 from smp_motor_ident.result import QUANTITIES, Quantity
 
 MODELS: Mapping[str, str] = {
@@ -58,17 +59,9 @@ def model(name: str) -> str:
     return MODELS.get(name, name.replace("_", " "))
 
 
-def spread(std: float | None) -> str:
+def spread(std: float) -> str:
     """Return a standard deviation with two digits."""
-    if std is None or not math.isfinite(std):
-        return "—"
-    if std == 0 or 1e-4 <= std < 1e3:
-        return _format_two_digits(std)
-    return f"{std:.1e}"
-
-
-def _format_two_digits(value: float) -> str:
-    return f"{float(f'{value:.2g}'):g}"
+    return format_figure(float(f"{std:.2g}"), 2)
 
 
 def state(quantity: Quantity, with_unit: bool = True) -> str:
@@ -100,21 +93,13 @@ def _format_numbers(between: str, values: Sequence[float], of: Quantity) -> str:
     places = 1 - math.floor(math.log10(float(f"{std:.1e}"))) + power
     places = min(places, MAX_DIGITS - 1 - math.floor(math.log10(size)) + power)
     text = between.join(_format_fixed(value / 10.0**power, places) for value in values)
-    superscript = str(power).translate(str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹"))
-    return f"({text})·10{superscript}" if power else text
+    return f"({text}){format_power(power)}" if power else text
 
 
 def _format_fixed(value: float, places: int) -> str:
-    """Return a number with so many decimals; a deviation too small for them with an exponent."""
+    """Return a number with so many decimals; a deviation too small for them with two digits."""
     rounded = round(value, places)
-    return f"{rounded:.{max(places, 0)}f}" if rounded or not value else f"{value:.1e}"
-
-
-def format_figure(value: float) -> str:
-    """Return a number with three digits, without an exponent up to a million."""
-    if math.isinf(value):
-        return "∞"
-    return f"{value:.0f}" if 100 <= abs(value) < 1e6 else f"{value:.3g}"
+    return f"{rounded:.{max(places, 0)}f}" if rounded or not value else spread(value)
 
 
 def _append_unit(text: str, unit: str) -> str:
@@ -127,7 +112,7 @@ def systematic(quantity: Quantity) -> str:
     words = []
     for one in shown.systematic:
         unit = _append_unit(spread(one.size), shown.unit)
-        size = f"{_format_two_digits(100 * one.share)} %" if one.share is not None else unit
+        size = f"{spread(100 * one.share)} %" if one.share is not None else unit
         words.append(f"± {size} ({cause(one.cause)})")
     volts = (quantity.valid or {}).get("voltage")
     return ", ".join([*words, *([f"observed at ±{volts[1]:.3g} V only"] if volts else [])])

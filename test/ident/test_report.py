@@ -13,7 +13,7 @@ from browser import CHROMIUM, Browser
 from results import PHYSICAL, comparison, correlation, estimate, tuning_of_two
 from scipy.signal import lfilter
 
-from smp_motor_ident.finding import Finding
+from smp_motor_ident.finding import Finding, format_figure
 from smp_motor_ident.report import tuning_page, words
 from smp_motor_ident.report.drawing import thin, ticks
 from smp_motor_ident.report.figures import Comparison, frequency_charts, residual_charts
@@ -88,7 +88,7 @@ def test_unreliable_finding_marks_its_quantities_or_all_if_none_are_named(named)
         (Quantity(0.0381133, 0.0016, (0.035, 0.0413), "s"), "38.1 ± 1.6 ms", "35.0 … 41.3"),
         (Quantity(864.0, 5700.0, (0.0, 12345.0), "V"), "900 ± 5700 V", "0 … 12300"),
         (Quantity(-2.7e-6, 6.6e-6, None, "V"), "(-2.7 ± 6.6)·10⁻⁶ V", "—"),
-        (Quantity(25.5, 3e-13, None, "rad/s/V"), "25.5000000 ± 3.0e-13 rad/s/V", "—"),
+        (Quantity(25.5, 3e-13, None, "rad/s/V"), "25.5000000 ± 3·10⁻¹³ rad/s/V", "—"),
         (Quantity(12.9, status="fixed", unit="ohm"), "12.9 Ω", "—"),
         (Quantity(None, ci95=(0.0, math.inf), unit="s"), "0 … ∞ ms", "0 … ∞"),
         (Quantity(None, unit="s"), "—", "—"),
@@ -103,11 +103,20 @@ def test_value_is_rounded_by_its_standard_deviation(quantity, number, between):
 @pytest.mark.parametrize(
     ("size", "share", "told"),
     [(28.0, 1.874, "± 190 % (delay)"), (0.04, 0.0031, "± 0.31 % (delay)"),
-     (150.0, None, "± 150 V (delay)")],
+     (150.0, None, "± 150 V (delay)"), (3.6e-5, None, "± 3.6·10⁻⁵ V (delay)")],
 )  # fmt: skip
 def test_systematic_errors_are_stated_with_two_digits_and_no_exponent(size, share, told):
     quantity = Quantity(14.9, 3.5, unit="V", systematic=(Share("delay", share, size),))
     assert words.systematic(quantity) == told
+
+
+@pytest.mark.parametrize(
+    ("value", "digits", "told"),
+    [(3.6e-5, 3, "3.6·10⁻⁵"), (2e-6, 2, "2·10⁻⁶"), (1234.5, 3, "1234"), (-2.5e7, 3, "-2.5·10⁷"),
+     (0.0456, 2, "0.046"), (0.0, 3, "0"), (-math.inf, 3, "∞")],
+)  # fmt: skip
+def test_figures_are_stated_without_an_exponent(value, digits, told):
+    assert format_figure(value, digits) == told
 
 
 def test_every_colour_of_the_charts_is_a_variable_of_the_page(page):
