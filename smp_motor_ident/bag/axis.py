@@ -87,14 +87,7 @@ def resample(motor: Context, series: dict[str, Series], axis_name: str) -> Recor
         _detect_hold(motor, voltage, series[axis_name], axis_name, starts) if alike else "after"
     )
     axis = axis[keep]
-    # Mean voltage over the interval that ends at each sample
-    values = (
-        voltage.value.copy()
-        if alike
-        else average_held_input(voltage.time, voltage.value, held, axis)
-    )
-    if alike and held == "after":
-        values[1:] = voltage.value[:-1]
+    values = average_held_input(voltage.time, voltage.value, held, axis)
     starts |= _find_gaps(motor, axis, alike, held, voltage, values)
     columns: dict[str, Any] = {
         name: _interpolate(motor, name, series[name], axis, keep)

@@ -114,11 +114,8 @@ def find_late_rows(u: Array, y: Array) -> int:
             break
         best = least
     leading = min(left[shift] for shift in range(-3, 1))
-    return (
-        best
-        if left[best] < min(MAX_LATE_COMMAND_RESIDUAL, MAX_SHIFTED_RESIDUAL_RATIO * leading)
-        else 0
-    )
+    most_left = min(MAX_LATE_COMMAND_RESIDUAL, MAX_SHIFTED_RESIDUAL_RATIO * leading)
+    return best if left[best] < most_left else 0
 
 
 def _explained_shares_by_shift(x: Array, y: Array, shifts: Integers) -> Array:

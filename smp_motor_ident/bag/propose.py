@@ -7,7 +7,7 @@ identify the time, the voltage or the motion of a table, the data decide.
 
 import re
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from itertools import product
 from typing import Any
 
@@ -44,12 +44,12 @@ class _Candidate:
     """A field that may be a signal of a wheel."""
 
     role: str
-    wheel: str
-    robot: str
     info: TopicInfo
     path: str
-    time: Array
-    value: Array
+    time: Array = field(default_factory=lambda: np.zeros(0))
+    value: Array = field(default_factory=lambda: np.zeros(0))
+    wheel: str = ""
+    robot: str = ""
 
     @property
     def source(self) -> str:
@@ -257,11 +257,8 @@ def _required_keys(
     if any(c.role == "count" or c.unit.startswith(":ticks") for c in chosen):
         asked["counts_per_revolution"] = "of the motor shaft"
     speed = next((c for c in chosen if c.role == "velocity" and not c.unit), None)
-    if (
-        table
-        and speed
-        and not re.search(names.WORDS_OF_RADIANS, names.split_words(speed.path), re.I)
-    ):
+    words = names.split_words(speed.path) if speed else ""
+    if table and speed and not re.search(names.WORDS_OF_RADIANS, words, re.I):
         asked["velocity"] = (
             f"its unit, {speed.source}:rpm or {speed.source}:deg/s, unless it is rad/s "
             f"(position={speed.source} if it is an angle)"
@@ -341,8 +338,7 @@ def _find_time_column(topics: list[TopicInfo]) -> _Candidate | None:
     for info in topics:
         for path in info.fields if info.table else []:
             if path != "value" and re.search(TIME_NAMES, path, re.IGNORECASE):
-                empty = np.zeros(0)
-                return _Candidate("time", "", "", info, path, empty, empty)
+                return _Candidate("time", info, path)
     return None
 
 
@@ -384,7 +380,7 @@ def _collect_candidates(
         whole = np.array_equal(value, np.rint(value))
         role = "position" if role == "count" and not whole else role
         if not (role == "voltage" and _is_supply(path, value)):
-            yield _Candidate(role, wheel, "", info, path, times, value)
+            yield _Candidate(role, info, path, times, value, wheel)
 
 
 def _find_wrap(angle: Array) -> float:
@@ -438,9 +434,8 @@ def _unexplained_share(voltage: _Candidate, motion: _Candidate) -> float | None:
     if motion.role != "velocity":
         turn = _find_wrap(y) if motion.role == "position" else 0.0
         steps = np.diff(np.unwrap(y, period=turn) if turn else y, prepend=y[:1])
-        if drives.compute_lagged_share(u, y) > drives.compute_lagged_share(
-            u, steps
-        ):  # counts of an interval are a speed
+        summed, itself = (drives.compute_lagged_share(u, x) for x in (steps, y))
+        if itself > summed:  # counts of an interval are a speed
             return None
         y = steps
     return drives.compute_unexplained_share(u, y)

@@ -137,13 +137,10 @@ class Monitor:
 
     def __init__(self, commissioned: CommissionedValues) -> None:
         self.commissioned = c = commissioned
-        start = np.array([c.resistance, c.motor_constant, c.inductance, 0.0])
-        size = np.array(
-            [PRIOR_STD["resistance"], PRIOR_STD["motor_constant"], PRIOR_STD["inductance"], 0.0]
-        )
-        pace = np.array(
-            [RANDOM_WALK_STD["resistance"], RANDOM_WALK_STD["motor_constant"], 0.0, 0.0]
-        )
+        names = ("resistance", "motor_constant", "inductance")
+        start = np.array([*(getattr(c, name) for name in names), 0.0])
+        size = np.array([*(PRIOR_STD[name] for name in names), 0.0])
+        pace = np.array([*(RANDOM_WALK_STD.get(name, 0.0) for name in names), 0.0])
         offset = np.array([0.0, 0.0, 0.0, 0.02 * c.supply_voltage])
         noise = (0.02 * c.supply_voltage * BLOCK_S) ** 2
         self._electrical = _Filter(

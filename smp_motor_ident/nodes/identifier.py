@@ -98,13 +98,9 @@ class Wheel:
         self.publisher = node.create_publisher(
             MotorParameters, f"{name}/motor_parameters", runtime.LATCHED
         )
-        topic = f"{name}/motor_state"
+        topic, group = f"{name}/motor_state", executor.PolledSubscriptions()
         self._states = node.create_subscription(
-            MotorState,
-            topic,
-            self._on_state,
-            STATE_QOS,
-            callback_group=executor.PolledSubscriptions(),
+            MotorState, topic, self._on_state, STATE_QOS, callback_group=group
         )
         topic = f"{name}/motor_description"
         node.create_subscription(MotorDescription, topic, self._on_description, runtime.LATCHED)
@@ -241,15 +237,10 @@ class Identifier(Node):
         valid = sum(wheel.status.startswith("valid") for wheel in self._wheels.values())
         level = runtime.OK if valid == len(states) else runtime.WARN
         message = f"{valid} of {len(states)} wheels identified"
-        doubled = [
-            f"{n}/motor_state" for n, w in self._wheels.items() if w.watch.has_two_publishers
-        ]
+        doubled = [n for n, w in self._wheels.items() if w.watch.has_two_publishers]
         if doubled:
-            return (
-                runtime.ERROR,
-                "; ".join(describe_two_publishers(self, one) for one in doubled),
-                states,
-            )
+            told = (describe_two_publishers(self, f"{name}/motor_state") for name in doubled)
+            return runtime.ERROR, "; ".join(told), states
         watched = {n: w.monitor for n, w in self._wheels.items() if w.monitor is not None}
         if watched:  # then a wheel without an estimate is no warning
             level, message = runtime.OK, f"{len(watched)} wheels watched; {message}"

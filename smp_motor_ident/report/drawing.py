@@ -5,6 +5,7 @@ import base64
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from html import escape
 from importlib import resources
 from typing import Literal
@@ -141,12 +142,8 @@ class _Plane:
         values.append(np.array(chart.lines))
         self._x_range = _find_range([chart.x], "x" in chart.log, 0.0)
         self._y_range = _find_range(values, "y" in chart.log, 0.05)
-
-    def x(self, values: Array) -> Array:
-        return _place(values, self._x_range, "x" in self.chart.log, LEFT, WIDTH - RIGHT)
-
-    def y(self, values: Array) -> Array:
-        return _place(values, self._y_range, "y" in self.chart.log, self.bottom, TOP)
+        self.x = partial(_place, (LEFT, WIDTH - RIGHT), self._x_range, "x" in chart.log)
+        self.y = partial(_place, (self.bottom, TOP), self._y_range, "y" in chart.log)
 
     def axes(self) -> list[str]:
         parts = []
@@ -201,8 +198,10 @@ def _find_range(values: Sequence[Array], log: bool, margin: float) -> tuple[floa
     return low - wide, high + wide
 
 
-def _place(values: Array, ends: tuple[float, float], log: bool, first: float, last: float) -> Array:
-    low, high = ends
+def _place(
+    edges: tuple[float, float], ends: tuple[float, float], log: bool, values: Array
+) -> Array:
+    (first, last), (low, high) = edges, ends
     with np.errstate(invalid="ignore", divide="ignore"):
         if log:
             values, low, high = np.log(values / low), 0.0, math.log(high / low)

@@ -12,7 +12,7 @@ from smp_motor_ident.report import figures, summary, templates, words
 from smp_motor_ident.report.comparison import compare
 from smp_motor_ident.report.drawing import Chart
 from smp_motor_ident.report.figures import Comparison
-from smp_motor_ident.result import QUANTITIES, Estimate, Quantity
+from smp_motor_ident.result import QUANTITIES, Estimate
 
 if TYPE_CHECKING:
     from smp_motor_ident.report.tuning_page import Tuning
@@ -50,6 +50,8 @@ def render(report: Report) -> str:
         "report.html.jinja",
         charts,
         report=report,
+        words=words,
+        quantities=QUANTITIES,
         licence=templates.text("uplot/LICENSE"),
         tuning_charts=tuning_charts,
         tuning_data=tuning_data,
@@ -68,14 +70,14 @@ def _describe(estimate: Estimate, report: Report) -> dict[str, Any]:
     residuals = figures.residual_charts(wheel, estimate.residuals)
     frequency = figures.frequency_charts(wheel, parts) if parts else []
     held = {**estimate.combinations, **estimate.parameters}
-    doubted = summary.find_doubted(estimate)
     grade, verdict = summary.judge(estimate)
     return {
         "estimate": estimate,
         "grade": grade,
         "verdict": verdict,
         "fit_percent": summary.describe_fit(estimate),
-        "rows": [_make_row(n, q, doubted.get(n)) for n, q in held.items() if words.is_stated(q)],
+        "stated": {n: q for n, q in held.items() if words.is_stated(q)},
+        "doubted": summary.find_doubted(estimate),
         "hidden": [words.label_in_sentence(n) for n, q in held.items() if not words.is_stated(q)],
         "messages": shown,
         "other": other,
@@ -107,19 +109,3 @@ def _describe_gains(estimate: Estimate, report: Report) -> tuple[str, str]:
         return f"No gains: {tuning.reason}", ""
     gains = f"p {found.gains.p:.4g}, i {found.gains.i:.4g}, d {found.gains.d:.4g}"
     return f"Gains of wheel_pid, in volts and rad/s of the wheel: {gains}; parameter file:", ""
-
-
-def _make_row(name: str, quantity: Quantity, doubt: int | None) -> dict[str, Any]:
-    """Return one row of a table of quantities; ``doubt`` is the number of a message against it."""
-    _, symbol, title, meaning = QUANTITIES.get(name, ("", "", words.label(name), ""))
-    return dict(
-        symbol=symbol,
-        name=title,
-        meaning=meaning,
-        value=words.state(quantity),
-        interval=words.interval(quantity),
-        systematic=words.systematic(quantity),
-        status=words.status(quantity),
-        kind=quantity.status,
-        doubt=doubt,
-    )

@@ -72,11 +72,8 @@ def head(rows: Sequence[Row], where: str) -> Grid:
     columns: dict[str, int] = {}
     for k in range(width):
         text = str(named[k]).strip() if k < len(named) and not _is_empty(named[k]) else f"c{k + 1}"
-        text = (
-            text[:_MAX_NAME_LENGTH]
-            if text[:_MAX_NAME_LENGTH] not in columns
-            else f"{text[:_MAX_NAME_LENGTH]}_{k + 1}"
-        )
+        text = text[:_MAX_NAME_LENGTH]
+        text = f"{text}_{k + 1}" if text in columns else text
         columns[text] = k
         bracket = _BRACKETS.search(text)
         unit = parse_unit(given[k] if k < len(given) else "") or (
