@@ -171,21 +171,16 @@ def _choose_times(motor: Context) -> dict[str, Integers]:
     if motor.plan.clock == "header" and poor:
         topic, reason = next(iter(poor.items()))
         raise BagError(f"{motor.where}: {topic} has no usable header time: {reason}")
-    fits = {
-        t: clock.fit_clock(stamp, tables[t].logged)
-        for t, stamp in stamps.items()
-        if t not in poor and stamp is not None
-    }
+    usable = {t: s for t, s in stamps.items() if s is not None and t not in poor}
+    fits = {t: clock.fit_clock(stamp, tables[t].logged) for t, stamp in usable.items()}
     offsets = [fit.offset for fit in fits.values()]
     if not poor and max(offsets) - min(offsets) < clock.MAX_CLOCK_OFFSET_NS:
         text = "time: header stamps (the instants of sampling, free of transport delay)"
         motor.report("time_base", text)
-        _report_offset(motor, next(iter(tables)), fits)
-        if any(
-            len(clock.split_at_resets(stamp)) > 1 for stamp in stamps.values() if stamp is not None
-        ):
-            return _times_across_resets(motor, tables, stamps)
-        return {topic: stamp for topic, stamp in stamps.items() if stamp is not None}
+        _report_offset(motor, *next(iter(fits.items())))
+        if any(len(clock.split_at_resets(stamp)) > 1 for stamp in usable.values()):
+            return _times_across_resets(motor, tables, usable)
+        return usable
     if not fits:
         motor.report("time_base", f"time: log times ({next(iter(poor.values()))})")
         return {topic: table.logged for topic, table in tables.items()}
@@ -194,15 +189,13 @@ def _choose_times(motor: Context) -> dict[str, Integers]:
     motor.report("time_base", text + (because or "the topics' clocks differ"))
     moved = {topic: table.logged for topic, table in tables.items()}
     for topic, fit in fits.items():
-        _report_offset(motor, topic, fits, always=True)
-        stamp = stamps[topic]
-        assert stamp is not None
-        moved[topic] = fit.to_log(stamp)
+        _report_offset(motor, topic, fit, always=True)
+        moved[topic] = fit.to_log(usable[topic])
     return moved
 
 
 def _times_across_resets(
-    motor: Context, tables: Mapping[str, Table], stamps: Mapping[str, Integers | None]
+    motor: Context, tables: Mapping[str, Table], stamps: Mapping[str, Integers]
 ) -> dict[str, Integers]:
     """Return times for a recording during which the clock of the stamps was set back."""
     if len(tables) > 1:
@@ -212,7 +205,6 @@ def _times_across_resets(
         return {topic: table.logged for topic, table in tables.items()}
     topic, table = next(iter(tables.items()))
     stamp = stamps[topic]
-    assert stamp is not None
     parts, log = clock.split_at_resets(stamp), table.logged
     least = clock.pause_between(stamp, parts, motor.plan.gap)
     pauses = [max(int(log[begin] - log[begin - 1]), least) for begin, _ in parts[1:]]
@@ -234,10 +226,7 @@ def _read_stamps(motor: Context, table: Table) -> Integers | None:
     return np.where(time == clock.MISSING_TIME, 0, time)
 
 
-def _report_offset(
-    motor: Context, topic: str, fits: Mapping[str, clock.ClockFit], always: bool = False
-) -> None:
-    fit = fits[topic]
+def _report_offset(motor: Context, topic: str, fit: clock.ClockFit, always: bool = False) -> None:
     if always or abs(fit.offset) > 1e9 or abs(fit.drift) > 1e-4:
         text = (
             f"{topic}: the recorder's clock is {fit.offset * 1e-9:+.6f} s from the header's, "

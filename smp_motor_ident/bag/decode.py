@@ -30,6 +30,7 @@ from smp_motor_ident.bag.types import Definitions, Types
 from smp_motor_ident.bag.unpack import Budget, decompress_messages
 from smp_motor_ident.errors import BagError
 
+_Columns = dict[str, NDArray[Any] | None]
 Part = tuple[NDArray[np.int64], list[NDArray[Any] | None]]
 """Messages of a batch with the same layout, and their columns; None for a missing column."""
 
@@ -159,11 +160,8 @@ class _Collector:
         self.topic, self.paths, self.types, self.budget = topic, paths, types, budget
         self._decoders: dict[tuple[str, str, str], Decoder] = {}
         self._count = 0
-        # Message indices and decoded values of each part, whose messages share a layout
-        self._rows: list[Integers] = []
-        self._log: list[Integers] = []
-        self._number: list[Integers | None] = []
-        self._columns: dict[str, list[NDArray[Any] | None]] = {}
+        # Indices, log times, numbers and columns of messages that share a layout
+        self._parts: list[tuple[Integers, Integers, Integers | None, _Columns]] = []
         self.packed = 0
 
     def add(self, batch: Batch) -> None:
@@ -173,12 +171,9 @@ class _Collector:
             return
         decoder = self._decoder(batch.channel)
         for rows, columns in decoder.decode(batch):
-            self._rows.append(self._count + rows)
-            self._log.append(batch.log_time[rows])
-            self._number.append(None if batch.sequence is None else batch.sequence[rows])
+            number = None if batch.sequence is None else batch.sequence[rows]
             held = dict(zip(decoder.paths, columns))
-            for name in {*self.paths, *STAMP}:
-                self._columns.setdefault(name, []).append(held.get(name))
+            self._parts.append((self._count + rows, batch.log_time[rows], number, held))
         self._count += len(batch)
 
     def _decoder(self, channel: Channel) -> Decoder:
@@ -201,18 +196,17 @@ class _Collector:
     def table(self) -> Table:
         """Return the collected columns in the order of the messages, and clear them."""
         none = np.zeros(0, np.int64)
-        rows = np.concatenate([none, *self._rows])
+        rows = np.concatenate([none, *(rows for rows, *_ in self._parts)])
         order = slice(None) if np.all(np.diff(rows) > 0) else np.argsort(rows)
-        sizes = [part.size for part in self._rows]
-        log = np.concatenate([none, *self._log])[order]
-        self._log.clear()
-        numbers = [part for part in self._number if part is not None and part.all()]
-        counted = 0 < len(numbers) == len(self._number)
+        log = np.concatenate([none, *(log for _, log, *_ in self._parts)])[order]
+        sizes = [rows.size for rows, *_ in self._parts]
+        numbers = [part for *_, part, _ in self._parts if part is not None and part.all()]
+        counted = 0 < len(numbers) == len(sizes)
         number = np.concatenate(numbers)[order] if counted else None
         columns: dict[str, NDArray[Any]] = {}
         present: dict[str, NDArray[np.bool_]] = {}
-        for name in list(self._columns):
-            parts = self._columns.pop(name)
+        for name in dict.fromkeys((*self.paths, *STAMP)):
+            parts = [held.pop(name, None) for *_, held in self._parts]
             known = [part.dtype for part in parts if part is not None]
             if not known:
                 continue

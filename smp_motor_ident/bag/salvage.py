@@ -7,8 +7,8 @@ records is that of https://www.sqlite.org/fileformat2.html, sections 1.6 and 2.1
 """
 
 from collections.abc import Iterator
+from mmap import ACCESS_READ, mmap
 from pathlib import Path
-from typing import BinaryIO
 
 Row = tuple[int, int, int, bytes]
 """id, topic_id, timestamp, data: a row of the bag's table of messages."""
@@ -37,23 +37,21 @@ def _read_integer(data: bytes, at: int, kind: int) -> int:
 class _Pages:
     """Access to the pages of a file."""
 
-    def __init__(self, file: BinaryIO, head: bytes, length: int) -> None:
-        self.length = length
-        size = int.from_bytes(head[16:18], "big")
+    def __init__(self, data: mmap) -> None:
+        size = int.from_bytes(data[16:18], "big")
         self.size = 65536 if size == 1 else size
-        self.usable = self.size - head[20]
-        self._file = file
+        self.usable = self.size - data[20]
+        self.data = data
 
     def read(self, number: int) -> bytes:
-        self._file.seek((number - 1) * self.size)
-        page = self._file.read(self.size)
+        page = self.data[(number - 1) * self.size : number * self.size]
         if len(page) < self.size:
             raise IndexError("the page is cut off")
         return page
 
     def payload(self, page: bytes, at: int, size: int) -> bytes:
         """Return a cell's content, which may go on in overflow pages."""
-        if size > self.length:
+        if size > len(self.data):
             raise IndexError("the row is longer than the file")
         most = self.usable - 35
         if size <= most:
@@ -99,12 +97,11 @@ def _read_row(pages: _Pages, page: bytes, at: int) -> Row | None:
 
 def salvage(path: Path) -> Iterator[list[Row]]:
     """Read the messages of every whole leaf page, in the order of the file."""
-    count = path.stat().st_size
-    with path.open("rb") as file:
-        pages = _Pages(file, file.read(100), count)
+    with path.open("rb") as file, mmap(file.fileno(), 0, access=ACCESS_READ) as data:
+        pages = _Pages(data)
         if pages.size < 512 or pages.usable < 480:
             return
-        for number in range(2, count // pages.size + 1):
+        for number in range(2, len(data) // pages.size + 1):
             page = pages.read(number)
             if page[0] != _LEAF:
                 continue

@@ -3,7 +3,7 @@
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -80,48 +80,43 @@ class Tables(Source):
                 )
 
 
+@dataclass(eq=False)
 class ColumnFile(Tables):
     """A file of columns, one table of the topic ``""``; ``dates`` are columns of nanoseconds."""
 
-    def __init__(
-        self,
-        path: Path,
-        name: str,
-        columns: Mapping[str, NDArray[Any]],
-        units: Mapping[str, str] | None = None,
-        dates: Collection[str] = (),
-        problems: Sequence[Finding] = (),
-        wheel_radius: float = 0.0,
-    ) -> None:
-        super().__init__(path, name)
-        self.problems += problems
-        if not columns:
-            raise BagError(f"{name}: holds no column of numbers; give a table of samples")
-        check_width(len(columns), name)
-        self._columns = columns
-        self._units = units or {}
-        self._dates = dates
-        self._radius = wheel_radius
+    path: Path
+    name: str
+    columns: Mapping[str, NDArray[Any]]
+    units: Mapping[str, str] = field(default_factory=dict)
+    dates: Collection[str] = ()
+    problems: list[Finding] = field(default_factory=list)
+    wheel_radius: float = 0.0
+
+    def __post_init__(self) -> None:
+        if not self.columns:
+            raise BagError(f"{self.name}: holds no column of numbers; give a table of samples")
+        check_width(len(self.columns), self.name)
 
     def channels(self) -> list[Channel]:
         """Return the one table."""
-        lengths = tuple(column.size for column in self._columns.values())
+        lengths = tuple(column.size for column in self.columns.values())
         lengths = lengths if len(set(lengths)) > 1 else ()
-        fields = tuple(self._columns)
-        channel = Channel(0, "", "", TABLE, fields=fields, units=self._units, lengths=lengths)
-        return [replace(channel, wheel_radius=self._radius)]
+        form: dict[str, Any] = dict(
+            units=self.units, lengths=lengths, wheel_radius=self.wheel_radius
+        )
+        return [Channel(0, "", "", TABLE, fields=tuple(self.columns), **form)]
 
     def table(self, topic: str, fields: Sequence[str]) -> Table:
         """Return columns; all must have the same length."""
-        self._check(fields, self._columns)
-        columns = {name: self._columns[name] for name in fields}
+        self._check(fields, self.columns)
+        columns = {name: self.columns[name] for name in fields}
         sizes = {name: column.size for name, column in columns.items()}
         if len(set(sizes.values())) > 1:
             lengths = ", ".join(f"{name} {size}" for name, size in sizes.items())
             raise BagError(
                 f"{self.path}: its columns differ in length: {lengths}; map columns of one length"
             )
-        exact = frozenset(n for n in fields if n in self._dates)
+        exact = frozenset(n for n in fields if n in self.dates)
         return Table(None, None, {n: np.asarray(c) for n, c in columns.items()}, exact=exact)
 
 
