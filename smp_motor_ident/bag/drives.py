@@ -13,7 +13,7 @@ from smp_motor_ident.limits import (
     MAX_SHIFTED_RESIDUAL_RATIO,
     MIN_EXPLAINED_SHARE,
 )
-from smp_motor_ident.quality.lag import apply_lag
+from smp_motor_ident.quality.lag import apply_lag, correlate
 
 COMMAND_LAGS, MOTION_LAGS = 6, 2
 MAX_DELAY_ROWS = 200  # largest delay of a command behind its motion that is searched [rows]
@@ -171,6 +171,4 @@ def _explained_share(x: Array, y: Array) -> float:
     """Return the share of the second explained by a positive multiple of the first."""
     every = max(y.size // MOTION_BLOCKS, 1)
     x, y = (v[: v.size // every * every].reshape(-1, every).mean(axis=1) for v in (x, y))
-    x, y = x - x.mean(), y - y.mean()
-    both = float((x @ x) * (y @ y))
-    return max(float(x @ y), 0.0) ** 2 / both if both > 0 else 0.0
+    return max(correlate(x, y), 0.0) ** 2

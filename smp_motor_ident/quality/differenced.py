@@ -60,7 +60,6 @@ def _sum_speed(record: Record) -> Record:
         moved
     ):
         return record
-    angle = np.cumsum(moved) * quantum * step
     if not _is_smooth_within_one_count(moved):
         return record
     found = Finding(
@@ -71,12 +70,8 @@ def _sum_speed(record: Record) -> Record:
         {"quantum": quantum},
         "record the encoder's counts",
     )
-    return replace(
-        record,
-        position=angle,
-        velocity_window=step,
-        findings=(*record.findings, found),
-    )
+    angle, findings = np.cumsum(moved) * quantum * step, (*record.findings, found)
+    return replace(record, position=angle, velocity_window=step, findings=findings)
 
 
 def read_count_rounding(record: Record) -> float:

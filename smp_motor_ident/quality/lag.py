@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Filter a signal by a first-order lag."""
+"""Filter a signal by a first-order lag, and correlate signals."""
 
 from __future__ import annotations
 
@@ -22,6 +22,13 @@ def apply_lag(values: Array, samples: float) -> Array:
     out = np.empty(values.size)
     _filter_lag(np.asarray(values, dtype=np.float64), float(np.exp(-1 / samples)), out)
     return out
+
+
+def correlate(x: Array, y: Array) -> float:
+    """Return the correlation of two signals, 0 where one is constant."""
+    x, y = x - x.mean(), y - y.mean()
+    power = float((x @ x) * (y @ y))
+    return float(x @ y) / power**0.5 if power > 0 else 0.0
 
 
 @compiled

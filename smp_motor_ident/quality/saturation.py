@@ -10,6 +10,7 @@ from smp_motor_ident import limits
 from smp_motor_ident.errors import SignalError
 from smp_motor_ident.finding import Finding
 from smp_motor_ident.limits import MIN_REGULATED_VARIANCE
+from smp_motor_ident.quality.lag import correlate
 from smp_motor_ident.record import Record
 
 SMOOTHING_SAMPLES = 9  # length of a moving mean that keeps the motion of a counted speed
@@ -81,18 +82,14 @@ def _fits_constant_current(rests: Flags, voltage: Array, speed: Array) -> bool:
     """
     padded = np.pad(np.nan_to_num(speed), SMOOTHING_SAMPLES // 2, mode="edge")
     smooth = np.convolve(padded, np.full(SMOOTHING_SAMPLES, 1 / SMOOTHING_SAMPLES), mode="valid")
-    v, w = voltage[rests], smooth[rests]
-    v, w = v - v.mean(), w - w.mean()
-    both = float(v @ w)
-    return both > 0 and both**2 > MIN_REGULATED_VARIANCE * float((v @ v) * (w @ w))
+    return max(correlate(voltage[rests], smooth[rests]), 0.0) ** 2 > MIN_REGULATED_VARIANCE
 
 
 def _has_one_level(v: Array) -> bool:
     """Return whether the voltage has one level, at which a motor may settle."""
     driven = v[np.abs(v) > limits.MAX_REST_VOLTAGE * np.abs(v).max()]
-    return not driven.size or bool(
-        np.ptp(driven) < 10 * limits.VOLTMETER_SCATTER * np.abs(driven).max()
-    )
+    scatter = 10 * limits.VOLTMETER_SCATTER * np.abs(driven).max(initial=0.0)
+    return not driven.size or bool(np.ptp(driven) < scatter)
 
 
 def _jumps_to_limit(x: Array, at: Flags) -> bool:

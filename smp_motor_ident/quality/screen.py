@@ -115,11 +115,8 @@ def _check_excitation(records: Sequence[Record], where: str) -> None:
         and float(np.ptp(r.voltage)) < 10 * limits.VOLTMETER_SCATTER * abs(level)
         for r, level in zip(records, levels, strict=True)
     ]
-    if (
-        all(still)
-        and float(np.ptp(levels)) < limits.VOLTMETER_SCATTER * abs(levels[0])
-        and not any(_rises_at_start(r) for r in records)
-    ):
+    one_level = float(np.ptp(levels)) < limits.VOLTMETER_SCATTER * abs(levels[0])
+    if all(still) and one_level and not any(_rises_at_start(r) for r in records):
         raise InsufficientExcitationError(
             f"{where}: the voltage is constant at {levels[0]:.4g} V; a constant "
             "input cannot tell dynamics: record a square or Fourier voltage in both directions"
@@ -257,22 +254,18 @@ def _check_signs(records: Sequence[Record], where: str, late: bool = True) -> No
         sure = limits.MIN_SIGN_STDS * found.chance
         # Samples of a current between switched voltages show little of it because of the lag.
         least = limits.MIN_SIGN_CORRELATION if what == "speed" else limits.MIN_TURNING_CORRELATION
-        if found.wrong - found.right > max(
-            least, min(sure, limits.MIN_TURNING_CORRELATION * found.wrong)
-        ):
+        most = max(least, min(sure, limits.MIN_TURNING_CORRELATION * found.wrong))
+        if found.wrong - found.right > most:
             refusal = SignalError if what == "speed" else CurrentError
             raise refusal(
                 f"{where}: swapped sign, {what} runs against the voltage "
                 f"(correlation {-found.wrong:.2f}); {remedy}"
             )
         follows = found.wrong > max(least, min(sure, limits.MIN_TURNING_CORRELATION))
-        if (
-            late
-            and what == "speed"
-            and follows
-            and found.wrong > limits.MIN_WRONG_SIGN_RATIO * found.right
-        ):
-            period = _find_sign_period(records)
+        opposite = found.wrong > limits.MIN_WRONG_SIGN_RATIO * found.right
+        if late and what == "speed" and follows and opposite:
+            changes = sum(np.count_nonzero(np.diff(np.sign(r.voltage))) for r in records)
+            period = 2 * sum(len(r) for r in records) / max(changes, 1)
             raise InsufficientExcitationError(
                 f"{where}: the voltage changes too fast, with a period of {period:.2g} "
                 "samples: a speed delayed by sampling, a filter or a window cannot be told from "
@@ -283,14 +276,5 @@ def _check_signs(records: Sequence[Record], where: str, late: bool = True) -> No
 def _select_turning(records: Sequence[Record]) -> list[Record]:
     """Return the records whose motor turned; others show only the sign of an offset."""
     scatter = [float(np.nanstd(measured_speed(r))) for r in records]
-    return [
-        r
-        for r, s in zip(records, scatter, strict=True)
-        if len(records) > 1 and s > limits.MAX_REST_VOLTAGE * max(scatter)
-    ]
-
-
-def _find_sign_period(records: Sequence[Record]) -> float:
-    """Return the period of the voltage's sign changes [samples]."""
-    changes = sum(np.count_nonzero(np.diff(np.sign(r.voltage))) for r in records)
-    return 2 * sum(len(r) for r in records) / max(changes, 1)
+    least = limits.MAX_REST_VOLTAGE * max(scatter)
+    return [r for r, s in zip(records, scatter, strict=True) if len(records) > 1 and s > least]

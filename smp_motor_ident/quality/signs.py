@@ -20,7 +20,7 @@ from smp_motor_ident.limits import (
     MIN_SIGN_CORRELATION,
     MIN_SIGN_STDS,
 )
-from smp_motor_ident.quality.lag import apply_lag
+from smp_motor_ident.quality.lag import apply_lag, correlate
 from smp_motor_ident.record import Record
 
 LAG_COUNT = 16  # from a sampling interval to a quarter of the record, each 1.5 to 2 times the last
@@ -160,13 +160,6 @@ def _is_magnitude(record: Record) -> bool:
     found = []
     for lag in np.geomspace(1.0, max(len(record) / 10, 2.0), MAGNITUDE_LAG_COUNT):
         made = apply_lag(volts, float(lag))[known]
-        found.append([_compute_r_squared(x, speed[known]) for x in (made, np.abs(made))])
+        found.append([correlate(x, speed[known]) ** 2 for x in (made, np.abs(made))])
     signed, size = np.max(found, axis=0)
     return bool(size > MIN_EXPLAINED_SHARE and signed < MIN_EXPLAINED_SHARE * size)
-
-
-def _compute_r_squared(x: Array, y: Array) -> float:
-    """Return the share of a variance explained by a line."""
-    x, y = x - x.mean(), y - y.mean()
-    both = float((x @ x) * (y @ y))
-    return float(x @ y) ** 2 / both if both > 0 else 0.0

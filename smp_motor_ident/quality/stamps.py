@@ -157,12 +157,6 @@ def _fit_line(number: Array, value: Array) -> tuple[float, float]:
     return value[i] - slope * number[i], slope
 
 
-def _is_rounded(beat: Beat, arrival: Integers) -> bool:
-    """Return whether arrivals are the beat rounded to the multiples that their stamps have."""
-    multiple = int(np.gcd.reduce(np.diff(arrival)))
-    return int(np.ptp(arrival - beat.time)) <= multiple
-
-
 def is_on_beat(beat: Beat, arrival: Integers, motion: Array) -> bool:
     """Return whether a motion was sampled on the beat rather than at its arrivals.
 
@@ -208,7 +202,9 @@ def move_to_beat(record: Record) -> Record:
     beat = find_beat(arrival)
     if beat is None:
         return record
-    if not (beat.repeated or _is_rounded(beat, arrival) or is_on_beat(beat, arrival, motion)):
+    multiple = np.gcd.reduce(np.diff(arrival))  # common to all stamps, where they are rounded
+    rounded = np.ptp(arrival - beat.time) <= multiple
+    if not (beat.repeated or rounded or is_on_beat(beat, arrival, motion)):
         return record
     period, latency = beat.period * 1e-9, beat.latency * 1e-9
     finding = Finding(
@@ -219,11 +215,8 @@ def move_to_beat(record: Record) -> Record:
         {"period": period, "deviation": beat.deviation * 1e-9, "latency": latency},
         "stamp each sample where it is measured",
     )
-    return replace(
-        record,
-        time=(beat.time - beat.time[0]) * 1e-9,
-        findings=(*record.findings, finding),
-    )
+    time = (beat.time - beat.time[0]) * 1e-9
+    return replace(record, time=time, findings=(*record.findings, finding))
 
 
 def merge_bunches(record: Record) -> Record:
