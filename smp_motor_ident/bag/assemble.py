@@ -160,52 +160,51 @@ def _check_series(motor: Context, series: dict[str, Series]) -> None:
 def _choose_times(motor: Context) -> dict[str, Integers]:
     """Return the time [ns] of every topic's messages, all on one clock."""
     tables = {topic: motor.tables[topic] for topic in motor.plan.topics}
+    logged = {topic: table.logged for topic, table in tables.items()}
     if all(table.clocked for table in tables.values()):
-        return {topic: table.logged for topic, table in tables.items()}
+        return logged
     stamps = {topic: _read_stamps(motor, table) for topic, table in tables.items()}
     if motor.plan.clock == "log":
         motor.report("time_base", "time: log times, as clock=log requests")
-        return {topic: table.logged for topic, table in tables.items()}
-    judged = {t: clock.judge_stamps(stamps[t], table.logged) for t, table in tables.items()}
+        return logged
+    judged = {topic: clock.judge_stamps(stamps[topic], log) for topic, log in logged.items()}
     poor = {topic: reason for topic, reason in judged.items() if reason}
     if motor.plan.clock == "header" and poor:
         topic, reason = next(iter(poor.items()))
         raise BagError(f"{motor.where}: {topic} has no usable header time: {reason}")
     usable = {t: s for t, s in stamps.items() if s is not None and t not in poor}
-    fits = {t: clock.fit_clock(stamp, tables[t].logged) for t, stamp in usable.items()}
+    fits = {topic: clock.fit_clock(stamp, logged[topic]) for topic, stamp in usable.items()}
     offsets = [fit.offset for fit in fits.values()]
     if not poor and max(offsets) - min(offsets) < clock.MAX_CLOCK_OFFSET_NS:
         text = "time: header stamps (the instants of sampling, free of transport delay)"
         motor.report("time_base", text)
         _report_offset(motor, *next(iter(fits.items())))
         if any(len(clock.split_at_resets(stamp)) > 1 for stamp in usable.values()):
-            return _times_across_resets(motor, tables, usable)
+            return _times_across_resets(motor, logged, usable)
         return usable
     if not fits:
         motor.report("time_base", f"time: log times ({next(iter(poor.values()))})")
-        return {topic: table.logged for topic, table in tables.items()}
+        return logged
     because = "; ".join(f"{topic}: {why}" for topic, why in poor.items())
     text = "time: header stamps moved to the recorder's clock by their offset and drift, because "
     motor.report("time_base", text + (because or "the topics' clocks differ"))
-    moved = {topic: table.logged for topic, table in tables.items()}
     for topic, fit in fits.items():
         _report_offset(motor, topic, fit, always=True)
-        moved[topic] = fit.to_log(usable[topic])
-    return moved
+    return logged | {topic: fit.to_log(usable[topic]) for topic, fit in fits.items()}
 
 
 def _times_across_resets(
-    motor: Context, tables: Mapping[str, Table], stamps: Mapping[str, Integers]
+    motor: Context, logged: dict[str, Integers], stamps: dict[str, Integers]
 ) -> dict[str, Integers]:
     """Return times for a recording during which the clock of the stamps was set back."""
-    if len(tables) > 1:
+    if len(logged) > 1:
         motor.findings.pop()
         text = "time: log times (the clock of the header stamps was set back while recording)"
         motor.report("time_base", text)
-        return {topic: table.logged for topic, table in tables.items()}
-    topic, table = next(iter(tables.items()))
+        return logged
+    ((topic, log),) = logged.items()
     stamp = stamps[topic]
-    parts, log = clock.split_at_resets(stamp), table.logged
+    parts = clock.split_at_resets(stamp)
     least = clock.pause_between(stamp, parts, motor.plan.gap)
     pauses = [max(int(log[begin] - log[begin - 1]), least) for begin, _ in parts[1:]]
     time = clock.concatenate_parts([stamp], [parts], pauses)[0]

@@ -61,7 +61,7 @@ def describe_topics(recording: source.Recording, types: Types) -> list[TopicInfo
             for count, fields in _group_by_length(c)
         ]
     found: dict[str, TopicInfo] = {}
-    spans: dict[str, tuple[int, int]] = {}
+    ends: dict[str, list[int]] = {}
     for channel in recording.channels():
         found.setdefault(channel.topic, TopicInfo(channel.topic, channel.type))
     for batch in chain.from_iterable(recording.batches(lambda _: True)):
@@ -71,12 +71,11 @@ def describe_topics(recording: source.Recording, types: Types) -> list[TopicInfo
             plain, _ = unpack.decompress_messages(batch.take(np.arange(1)), recording.budget)
             info.fields, info.remark = _list_fields(types, plain) if len(plain) else ([], "damaged")
         info.count += len(batch)
-        first, last = spans.get(topic, (2**63 - 1, -(2**63)))
         times = batch.log_time
-        spans[topic] = (min(first, int(times.min())), max(last, int(times.max())))
-    for topic, (first, last) in spans.items():
-        if last > first:
-            found[topic].rate = (found[topic].count - 1) / ((last - first) * 1e-9)
+        ends.setdefault(topic, []).extend([int(times.min()), int(times.max())])
+    for topic, instants in ends.items():
+        if span := max(instants) - min(instants):
+            found[topic].rate = (found[topic].count - 1) / (span * 1e-9)
     return [found[topic] for topic in sorted(found)]
 
 

@@ -132,15 +132,10 @@ def decompress_messages(batch: Batch, budget: Budget) -> tuple[Batch, int]:
     if not sound.any():
         return batch, 0
     first = gather(batch.data, np.where(sound, batch.offset, batch.offset[sound][0]), "<u4")
-    packed = {
-        kind: sound & (first == int.from_bytes(magic, "little")) for magic, kind in MAGIC.items()
-    }
-    if not any(which.any() for which in packed.values()):
+    if not np.any(sound & np.isin(first, [int.from_bytes(magic, "little") for magic in MAGIC])):
         return batch, 0
-    blobs = []
-    for k in range(len(batch)):
-        kind = next((kind for kind, which in packed.items() if which[k]), "")
-        blobs.append(decompress(batch.message(k), kind, budget))
+    messages = map(batch.message, range(len(batch)))
+    blobs = [decompress(data, MAGIC.get(data[:4], ""), budget) for data in messages]
     kept = np.array([bool(blob) for blob in blobs])
     joined = join(batch.channel, [b for b in blobs if b], batch.log_time[kept])
     if batch.sequence is not None:

@@ -79,7 +79,7 @@ class _Draft:
         """Do nothing: messages are written together with the closing records."""
 
 
-class BagWriter:
+class BagWriter(contextlib.AbstractContextManager["BagWriter"]):
     """Writer of an MCAP bag folder in the layout of rosbag2 of ROS 2 Jazzy (metadata version 9).
 
     The folder must not exist.  A kill of the process loses at most the messages of the last
@@ -267,10 +267,6 @@ class BagWriter:
             finally:
                 self._closed = True
                 self._file.close()
-
-    def __enter__(self) -> "BagWriter":
-        """Return the writer."""
-        return self
 
     def __exit__(self, *error: object) -> None:
         """Close the bag, also after an error, and keep the recorded messages."""

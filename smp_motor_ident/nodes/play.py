@@ -104,10 +104,10 @@ class Player(Node):
         """Play the bag from the offset to its end; return whether there was anything."""
         options = self._options
         begin: float | None = None
-        first = skipped = 0
+        first: int | None = None  # stamp at which to begin
         for channel, stamp, data in self._replay.messages(lambda c: c.topic in self._outputs):
-            if not skipped:
-                first, skipped = stamp + round(options.start_offset * 1e9), 1
+            if first is None:
+                first = stamp + round(options.start_offset * 1e9)
             if stamp < first:
                 continue
             if begin is None:
@@ -120,10 +120,10 @@ class Player(Node):
                 publisher.publish(data)
                 self.sent[channel.topic] += 1
         if begin is None:
-            raise SmpError(
-                "there is no message"
-                + (f" behind an offset of {options.start_offset:g} s" if skipped else " in the bag")
+            where = (
+                "in the bag" if first is None else f"behind an offset of {options.start_offset:g} s"
             )
+            raise SmpError(f"there is no message {where}")
         return True
 
     def _wait_until(self, due: float, begin: float, first: int) -> bool:

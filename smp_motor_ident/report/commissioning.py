@@ -162,8 +162,7 @@ def render(
         charts(changes),
         document=document,
         verdict=_verdict(document),
-        findings=[one for one in findings if one["severity"] != "note"],
-        notes=[one for one in findings if one["severity"] == "note"],
+        findings=findings,
         results=known,
         # Without the comments on their origin, which are in the file
         parameters="\n".join(x for x in parameters.splitlines() if not x.startswith("#")),

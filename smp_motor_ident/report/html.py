@@ -82,21 +82,13 @@ def _describe(estimate: Estimate, report: Report) -> dict[str, Any]:
         "messages": shown,
         "other": other,
         "gains": _describe_gains(estimate, report),
-        "chain": _list_components(estimate),
+        "chain": rebuild_chain(estimate.chain).components,
         "charts": [*fit, *residuals, *frequency, *since],
         "history": since,
         "fit": fit,
         "residuals": residuals,
         "frequency": frequency,
     }
-
-
-def _list_components(estimate: Estimate) -> list[str]:
-    """Return the components of the chain in words, motor and sensors as such."""
-    return [
-        f"{one.title} ({one.slot})" if one.slot == "motor" or "sensor" in one.slot else one.title
-        for one in rebuild_chain(estimate.chain).components
-    ]
 
 
 def _describe_gains(estimate: Estimate, report: Report) -> tuple[str, str]:

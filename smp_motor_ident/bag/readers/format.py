@@ -3,7 +3,7 @@
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -101,10 +101,9 @@ class ColumnFile(Tables):
         """Return the one table."""
         lengths = tuple(column.size for column in self.columns.values())
         lengths = lengths if len(set(lengths)) > 1 else ()
-        form: dict[str, Any] = dict(
-            units=self.units, lengths=lengths, wheel_radius=self.wheel_radius
-        )
-        return [Channel(0, "", "", TABLE, fields=tuple(self.columns), **form)]
+        fields = tuple(self.columns)
+        channel = Channel(0, "", "", TABLE, fields=fields, units=self.units, lengths=lengths)
+        return [replace(channel, wheel_radius=self.wheel_radius)]
 
     def table(self, topic: str, fields: Sequence[str]) -> Table:
         """Return columns; all must have the same length."""

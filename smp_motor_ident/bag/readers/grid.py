@@ -27,7 +27,7 @@ _WORDS = {
     **dict.fromkeys(("rev", "reverse", "backward", "backwards", "bwd", "r", "b", "ccw"), -1),
 }
 _ISO = re.compile(
-    r"(?:(\d{4}-\d\d-\d\d)[T _.])?(\d\d?:\d\d:\d\d(?:[.,]\d{1,9})?) ?(Z|[+-]\d\d:?\d\d)?"
+    r"(?:(\d{4}-\d\d-\d\d)[T _.])?(\d\d?):(\d\d):(\d\d)(?:[.,](\d{1,9}))? ?(Z|[+-]\d\d:?\d\d)?"
 )
 _BRACKETS = re.compile(r"\s*[\[(]([^\])]*)[\])]\s*$")
 _EXAMINED_ROWS = 60  # rows examined to tell names from numbers
@@ -167,13 +167,11 @@ def nanoseconds(cell: Any) -> int:
     match = _ISO.fullmatch(str(cell).strip())
     if match is None or (match[1] and int(match[1][:4]) not in _YEARS):
         raise ValueError(f"{cell!r} is neither number nor time")
-    days = int(np.datetime64(match[1] or "1970-01-01", "D").astype(np.int64))
-    hours, minutes, seconds = re.split(":", match[2].replace(",", "."))
-    whole, _, part = seconds.partition(".")
-    zone = match[3] if match[3] not in (None, "Z") else "+00:00"
-    shift = (1 if zone[0] == "+" else -1) * (60 * int(zone[1:3]) + int(zone[-2:]))
+    day, hours, minutes, seconds, part, zone = match.groups("")
+    days = int(np.datetime64(day or "1970-01-01", "D").astype(np.int64))
+    shift = int(f"{zone[0]}1") * (60 * int(zone[1:3]) + int(zone[-2:])) if zone.strip("Z") else 0
     since = (24 * days + int(hours)) * 60 + int(minutes) - shift
-    return (60 * since + int(whole)) * 10**9 + int(part.ljust(9, "0"))
+    return (60 * since + int(seconds)) * 10**9 + int(part.ljust(9, "0"))
 
 
 def columns(

@@ -50,11 +50,7 @@ _MAX_CELLS = 5_000_000
 
 def _open(path: Path, name: str, budget: Budget) -> ColumnFile:
     """Read a ``.json`` or ``.jsonl`` file."""
-    try:
-        text = path.read_text("utf-8-sig")
-    except UnicodeDecodeError as error:
-        raise BagError(f"{name}: no readable JSON ({_describe_error(error)})") from None
-    document, problem = _parse(text, name, whole=path.suffix.lower() == ".json")
+    document, problem = _parse(path, name)
     units: dict[str, str] = {}
     dates: set[str] = set()
     radius = 0.0
@@ -70,15 +66,16 @@ def _open(path: Path, name: str, budget: Budget) -> ColumnFile:
     return ColumnFile(path, name, columns, units, dates, problems, radius)
 
 
-def _parse(text: str, name: str, *, whole: bool) -> tuple[Any, str]:
-    """Return the content of a text and a remark on errors; accept JSON lines in ``.json``."""
+def _parse(path: Path, name: str) -> tuple[Any, str]:
+    """Return the content of a file and a remark on errors; accept JSON lines in ``.json``."""
     reason = ""
-    if whole:
-        try:
-            return json.loads(text), ""
-        except (ValueError, RecursionError) as error:
-            reason = _describe_error(error)
     try:
+        text = path.read_text("utf-8-sig")
+        if path.suffix.lower() == ".json":
+            try:
+                return json.loads(text), ""
+            except (ValueError, RecursionError) as error:
+                reason = _describe_error(error)
         return _parse_lines(text, name)
     except (ValueError, RecursionError) as error:
         raise BagError(f"{name}: no readable JSON ({reason or _describe_error(error)})") from None

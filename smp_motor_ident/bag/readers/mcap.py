@@ -46,14 +46,11 @@ _BLOCK = 1 << 22
 def _read_fields(op: int, body: bytes) -> list[Any]:
     """Return a record's fields, and the bytes behind them; one of `_DAMAGE` if it ends early."""
     file = io.BytesIO(body)
-    readers = {"s": read_string, "b": read_bytes, "m": _read_texts, "i": _read_index}
-    fields = [
-        readers[kind](file)
-        if kind in readers
-        else int.from_bytes(read_exact(file, int(kind)), "little")
-        for kind in _LAYOUTS[op]
-    ]
-    return [*fields, file.read()]
+    return [*(_READERS[kind](file) for kind in _LAYOUTS[op]), file.read()]
+
+
+def _read_number(size: int) -> Callable[[BinaryIO], int]:
+    return lambda file: int.from_bytes(read_exact(file, size), "little")
 
 
 def _read_texts(file: BinaryIO) -> dict[str, str]:
@@ -67,6 +64,12 @@ def _read_texts(file: BinaryIO) -> dict[str, str]:
 
 def _read_index(file: BinaryIO) -> dict[int, int]:
     return dict(struct.iter_unpack("<HQ", read_bytes(file)))
+
+
+_READERS: dict[str, Callable[[BinaryIO], Any]] = {
+    **{"2": _read_number(2), "4": _read_number(4), "8": _read_number(8)},
+    **{"s": read_string, "b": read_bytes, "m": _read_texts, "i": _read_index},
+}
 
 
 def read_summary(file: BinaryIO) -> dict[int, list[list[Any]]] | None:
