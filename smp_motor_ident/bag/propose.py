@@ -335,11 +335,9 @@ def _fill_placeholders(proposal: Proposal) -> mapping.SignalMap:
 
 def _find_time_column(topics: list[TopicInfo]) -> _Candidate | None:
     """Return the column of time of a table."""
-    for info in topics:
-        for path in info.fields if info.table else []:
-            if path != "value" and re.search(TIME_NAMES, path, re.IGNORECASE):
-                return _Candidate("time", info, path)
-    return None
+    columns = ((info, path) for info in topics if info.table for path in info.fields)
+    named = (c for c in columns if c[1] != "value" and re.search(TIME_NAMES, c[1], re.IGNORECASE))
+    return next((_Candidate("time", info, path) for info, path in named), None)
 
 
 def _collect_candidates(

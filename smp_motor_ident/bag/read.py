@@ -205,12 +205,9 @@ def _assemble_records(recording: Recording, asked: SignalMap, types: Types) -> l
 def _plan(recording: Recording, asked: SignalMap, channels: list[Channel]) -> dict[str, MotorMap]:
     """Return the signals of every wheel, mapped by the user or given by our own messages."""
     topics = {channel.topic for channel in channels}
-    if any(motor.signals for motor in asked.motors.values()):
-        plans = {
-            wheel: resolve_signals(plan, channels)
-            for wheel, plan in asked.motors.items()
-            if plan.signals
-        }
+    mapped = {wheel: plan for wheel, plan in asked.motors.items() if plan.signals}
+    if mapped:
+        plans = {wheel: resolve_signals(plan, channels) for wheel, plan in mapped.items()}
         for wheel, plan in plans.items():
             for name, signal in plan.signals.items():
                 if signal.topic not in topics:
@@ -222,14 +219,13 @@ def _plan(recording: Recording, asked: SignalMap, channels: list[Channel]) -> di
         return plans
     if recording.is_table:
         return plan_from_names(recording, asked)
-    states = sorted(channel.topic for channel in channels if channel.type == STATE)
+    states = sorted({channel.topic for channel in channels if channel.type == STATE})
     if not states:
         raise BagError(
             f"{recording.name}: has no topic of type {STATE}; it has "
             f"{', '.join(sorted(topics)) or 'no topics at all'}. Map its signals, such as "
             "voltage=/pwm.data*12/255 (identify --topics suggests how)"
         )
-    states = list(dict.fromkeys(states))
     names = {topic: topic.rpartition("/")[0].rpartition("/")[2] or topic[1:] for topic in states}
     if len(set(names.values())) < len(names):  # two robots: keep their namespaces
         names = {topic: topic.rpartition("/")[0][1:] or topic[1:] for topic in states}

@@ -80,10 +80,8 @@ class Types:
         self._left = 6 * MAX_DEFINITION_SIZE
         for given in files:
             path = Path(given)
-            found = (
-                sorted(p for p in path.rglob("*.msg") if p.is_file()) if path.is_dir() else [path]
-            )
-            if not found or not found[0].is_file():
+            inside = path.rglob("*.msg") if path.is_dir() else [path]
+            if not (found := sorted(filter(Path.is_file, inside))):
                 raise BagError(f"{path}: no .msg file there")
             for file in found:
                 folder = file.resolve().parent

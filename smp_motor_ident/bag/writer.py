@@ -86,12 +86,7 @@ class BagWriter(contextlib.AbstractContextManager["BagWriter"]):
     ``flush_period`` [s]; after many hours, those of some seconds.
     """
 
-    def __init__(
-        self,
-        path: str | os.PathLike[str],
-        *,
-        flush_period: float = FLUSH_PERIOD,
-    ) -> None:
+    def __init__(self, path: str | os.PathLike[str], *, flush_period: float = FLUSH_PERIOD) -> None:
         self.path = Path(path)
         self._file_name = f"{self.path.resolve().name}_0.mcap"
         self._distribution = os.environ.get("ROS_DISTRO", "") or "jazzy"

@@ -14,11 +14,7 @@ from smp_motor_ident.quality.glitches import count_glitches
 from smp_motor_ident.quality.saturation import refuse_saturation
 from smp_motor_ident.quality.signs import correlate_with_voltage, refuse_lost_sign
 from smp_motor_ident.quality.silence import refuse_silent_sensor
-from smp_motor_ident.quality.units import (
-    check_voltage,
-    explain_ratio,
-    refuse_mixed_time_units,
-)
+from smp_motor_ident.quality.units import check_voltage, explain_ratio, refuse_mixed_time_units
 from smp_motor_ident.record import Record
 
 

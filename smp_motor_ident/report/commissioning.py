@@ -148,10 +148,7 @@ def charts(changes: Sequence[Change]) -> list[Chart]:
 
 
 def render(
-    document: Mapping[str, Any],
-    changes: Sequence[Change],
-    known: Results,
-    parameters: str,
+    document: Mapping[str, Any], changes: Sequence[Change], known: Results, parameters: str
 ) -> str:
     """Return the page of ``commissioning.json``, with motors, gains and drive."""
     findings = sorted(

@@ -3,6 +3,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Literal
 
 import numpy as np
@@ -38,13 +39,9 @@ class Comparison:
 
 def fit_charts(wheel: str, parts: Sequence[Comparison], lag: float = 0.0) -> list[Chart]:
     """Return speed, residual and voltage over all stretches; the view begins at the liveliest."""
-    begin, times, spans = 0.0, [], []
-    for part in parts:
-        times.append(begin + part.time)
-        end = begin + float(part.time[-1])
-        spans.append((begin, end, part.role))
-        begin = end
-    time = np.concatenate(times)
+    ends = np.cumsum([0.0, *(float(part.time[-1]) for part in parts)]).tolist()
+    spans = [(*span, part.role) for span, part in zip(pairwise(ends), parts)]
+    time = np.concatenate([begin + part.time for begin, part in zip(ends, parts)])
     measured = np.concatenate([part.measured for part in parts])
     simulated = np.concatenate([part.simulated for part in parts])
     voltage = np.concatenate([part.voltage for part in parts])

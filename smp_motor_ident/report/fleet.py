@@ -148,9 +148,7 @@ def table(rows: Sequence[Row]) -> tuple[str, bytes]:
         import pyarrow.parquet
     except ImportError:
         text = io.StringIO(newline="")
-        writer = csv.writer(text)
-        writer.writerow(held)
-        writer.writerows(zip(*held.values(), strict=True))
+        csv.writer(text).writerows([held, *zip(*held.values(), strict=True)])
         return "fleet.csv", text.getvalue().encode()
     sink = pyarrow.BufferOutputStream()
     pyarrow.parquet.write_table(pyarrow.table(held), sink)

@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from smp_motor_ident.bag.readers.format import Format, Tables, check_width
-from smp_motor_ident.bag.storage import TABLE, Channel, Table
+from smp_motor_ident.bag.storage import TABLE, Channel, Table, gather
 from smp_motor_ident.bag.units import parse_unit
 from smp_motor_ident.bag.unpack import Budget
 from smp_motor_ident.errors import BagError
@@ -110,11 +110,8 @@ class _Wpilog(Tables):
         sound = size >= least if entry.kind.endswith("[]") else size == least
         log = 1000 * np.array(entry.times, np.uint64).astype(np.int64)
         raw = np.frombuffer(self._data, np.uint8)
-        bytes_of = begin[sound, None] + np.arange(kind.itemsize)
-        columns = {
-            name: raw[bytes_of + k * kind.itemsize].copy().view(kind)[:, 0]
-            for name, k in zip(fields, index)
-        }
+        places = {name: begin[sound] + k * kind.itemsize for name, k in zip(fields, index)}
+        columns = {name: gather(raw, at, kind.str) for name, at in places.items()}
         return Table(log[sound], None, columns)
 
 

@@ -35,14 +35,12 @@ def main() -> None:
     kind, path, memory = sys.argv[1], Path(sys.argv[2]), int(sys.argv[3])
     head: dict[str, Any] = {"error": "", "too_large": False, "objects": []}
     parts: list[bytes] = []
-    left = memory
     try:
         read = _workbook(path, memory) if kind == "Excel" else _variables_of(path, memory, head)
         for name, part in read:
             head.setdefault(name[0], []).append(name[1])
             parts.append(part)
-            left -= len(part)
-            if left < 0:
+            if sum(map(len, parts)) > memory:
                 raise MemoryError
     except Unreadable as error:
         head["error"] = str(error)
