@@ -6,8 +6,9 @@ neither aligns fields nor has these bytes.
 """
 
 import re
+import struct
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -50,8 +51,7 @@ class Template:
     """Positions of the values and lengths of one message."""
 
     root: dict[str, Any]
-    lengths: list[int] = field(default_factory=list)
-    order: str = "<"
+    lengths: list[int]
 
 
 def parse_path(path: str) -> list[str | int]:
@@ -92,7 +92,7 @@ class _Parser:
         rest = len(self.data) - self.position
         if not 0 <= rest <= (0 if self.ros1 else 3):  # writers may pad to a multiple of four
             raise DecodeError(f"{rest} bytes follow its last field")
-        return Template(root, self.lengths, self.order)
+        return Template(root, self.lengths)
 
     def message(self, name: str) -> dict[str, Any]:
         fields = self.definitions[name]
@@ -132,9 +132,7 @@ class _Parser:
     def length(self) -> int:
         begin = self.take(4, 4)
         self.lengths.append(begin)
-        return int.from_bytes(
-            self.data[begin : begin + 4], "little" if self.order == "<" else "big"
-        )
+        return int(struct.unpack_from(f"{self.order}I", self.data, begin)[0])
 
     def text(self) -> Text:
         begin = self._aligned(4)
