@@ -52,9 +52,9 @@ class _CsvFile(Tables):
             mark = next((c for c in ";\t," if c in usual), " ")
             self._lines = [s.replace(_ARROW, mark) for s in self._lines]
         labels, seen = self._split_labels(seen)
-        self._find_separator = _find_separator([self._lines[k] for k in seen])
-        rows = [_split_row(self._lines[k], self._find_separator) for k in seen]
-        if self._find_separator == " ":
+        self._separator = _find_separator([self._lines[k] for k in seen])
+        rows = [_split_row(self._lines[k], self._separator) for k in seen]
+        if self._separator == " ":
             rows = [
                 self._split_names(self._lines[k], row, len(rows[len(rows) // 2]))
                 for k, row in zip(seen, rows)
@@ -79,7 +79,7 @@ class _CsvFile(Tables):
         found = {}
         # Single letters may be words of any column
         for j in [j for j, name in enumerate(self._grid.names) if separates_motors(name, "A")]:
-            rows = {k: _split_row(s, self._find_separator) for k, s in enumerate(self._lines)}
+            rows = {k: _split_row(s, self._separator) for k, s in enumerate(self._lines)}
             body = {k: row for k, row in rows.items() if k >= self._first and j < len(row)}
             words = grid.words([row[j].strip() for row in body.values()])
             if words and separates_motors(self._grid.names[j], words):
@@ -87,8 +87,8 @@ class _CsvFile(Tables):
                 for k, row in body.items():
                     if row[j].strip() in words:
                         row[j] = str(words.index(row[j].strip()))
-                        quoted = (f'"{c}"' if self._find_separator in c else c for c in row)
-                        self._lines[k] = self._find_separator.join(quoted)
+                        quoted = (f'"{c}"' if self._separator in c else c for c in row)
+                        self._lines[k] = self._separator.join(quoted)
         return found
 
     def table(self, topic: str, fields: Sequence[str]) -> Table:
@@ -101,7 +101,7 @@ class _CsvFile(Tables):
             return Table(None, None, dict(zip(fields, fast)))
         body = self._lines[self._first :]
         lines = [k for k, s in enumerate(body, self._first + 1) if not s.startswith("#")]
-        rows = [_split_row(s, self._find_separator) for s in body if not s.startswith("#")]
+        rows = [_split_row(s, self._separator) for s in body if not s.startswith("#")]
         values, findings, dates = grid.columns(rows, use, fields, str(self.path), lines)
         columns = dict(zip(fields, values))
         return Table(None, None, columns, findings=findings, exact=frozenset(dates))
@@ -111,7 +111,7 @@ class _CsvFile(Tables):
         try:
             values = np.loadtxt(
                 (f"{line}\n" for line in islice(self._lines, self._first, None)),
-                delimiter=None if self._find_separator == " " else self._find_separator,
+                delimiter=None if self._separator == " " else self._separator,
                 usecols=use,
                 ndmin=2,
                 quotechar='"',
@@ -163,7 +163,7 @@ class _CsvFile(Tables):
 
     def _split_comment(self, text: str, width: int) -> list[str]:
         """Return the cells of a comment where it has as many as the rows, none of them empty."""
-        marks = [*self._find_separator.strip(), *";\t|,", *[None][: self._find_separator == " "]]
+        marks = [*self._separator.strip(), *";\t|,", *[None][: self._separator == " "]]
         several = [[cell.strip(' \t"') for cell in text.split(mark)] for mark in marks]
         return next((c for c in several if len(c) == width and all(c)), [])
 
