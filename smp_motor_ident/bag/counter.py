@@ -89,13 +89,6 @@ def round_to_turns(wrap: Wrap) -> float:
     return next((w for n in turns if wrap.admits(w := 2 * np.pi * n)), wrap.width)
 
 
-def undo_wraps(value: Array, width: float) -> Array:
-    """Return a signal without its wraps."""
-    steps = np.diff(value)
-    whole = steps - width * np.rint(steps / width)
-    return np.concatenate([value[:1], value[:1] + np.cumsum(whole)])
-
-
 @dataclass(frozen=True, eq=False)
 class Unwrapped:
     """A counter that no longer wraps; ``resets`` are the samples where it started again."""
@@ -120,7 +113,7 @@ def unwrap(count: Integers, bits: int | None, expected: Array | None = None) -> 
     if bits is None and (width := _estimate_width(count, steps, guess)):
         if width & (width - 1):
             text = f"the encoder starts again at {width} counts; it was unwrapped"
-            whole = np.rint(undo_wraps(count.astype(np.float64), width)).astype(np.int64)
+            whole = np.rint(np.unwrap(count.astype(np.float64), period=width)).astype(np.int64)
             findings.append(note("counter_wraps", text, counts=width))
             return Unwrapped(whole, np.zeros(0, np.int64), findings)
         bits = width.bit_length() - 1
@@ -247,7 +240,7 @@ def unwrap_angle(angle: Array) -> tuple[Array, float]:
                 "which is not a turn or a part of one; record faster, or a continuous angle"
             )
     result = angle.copy()
-    result[sound] = undo_wraps(values, width)
+    result[sound] = np.unwrap(values, period=width)
     check_aliasing(np.diff(result[sound]), width, "angle")
     return result, width
 

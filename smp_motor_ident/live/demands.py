@@ -47,8 +47,6 @@ def find_missing_excitation(record: Record | None) -> list[str]:
 
 def _shares(voltage: Array) -> Array:
     """Return the shares of the samples in each of the levels of voltage."""
-    low, span = voltage.min(), np.ptp(voltage)
-    if span <= ROUNDING * np.abs(voltage).max():
+    if np.ptp(voltage) <= ROUNDING * np.abs(voltage).max():
         return np.ones(1)
-    level = np.minimum((voltage - low) / span * LEVELS, LEVELS - 1).astype(np.int64)
-    return np.bincount(level, minlength=LEVELS) / voltage.size
+    return np.histogram(voltage, LEVELS)[0] / voltage.size

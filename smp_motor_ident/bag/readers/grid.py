@@ -89,7 +89,7 @@ def numeric(names: Sequence[str], rows: Sequence[Row]) -> tuple[str, ...]:
     filled = [[row[k] for row in rows if k < len(row)] for k in range(len(names))]
     filled = [[cell for cell in column if not _is_empty(cell)] for column in filled]
     return tuple(
-        name for name, cells in zip(names, filled) if not cells or any(map(_is_convertible, cells))
+        name for name, cells in zip(names, filled) if not cells or any(map(is_convertible, cells))
     )
 
 
@@ -127,13 +127,14 @@ def share_of_numbers(row: Row) -> float:
 
 
 def _is_number(cell: Any) -> bool:
-    return _is_convertible(cell) and not (isinstance(cell, str) and cell.strip().lower() in _WORDS)
+    return is_convertible(cell) and not (isinstance(cell, str) and cell.strip().lower() in _WORDS)
 
 
-def _is_convertible(cell: Any) -> bool:
+def is_convertible(cell: Any) -> bool:
+    """Return whether a cell is a number, empty, or a word or time that counts as one."""
     try:
         number(cell)
-    except ValueError:
+    except (ValueError, OverflowError):
         return False
     return True
 

@@ -133,16 +133,10 @@ def _columns(
         except BagError:
             continue  # a column of words
         if values[0].size != len(value):  # missing values are no empty rows here
-            values = [np.array([_convert_number(cell) for cell in column])]
+            filled = (grid.number(c) if grid.is_convertible(c) else np.nan for c in column)
+            values = [np.array([*filled])]
         yield key, values[0]
         dates |= timed
-
-
-def _convert_number(cell: Any) -> float:
-    try:
-        return grid.number(cell)
-    except (ValueError, OverflowError):
-        return np.nan
 
 
 def _flatten(prefix: str, row: Any, depth: int) -> Iterator[tuple[str, Any]]:
