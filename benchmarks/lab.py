@@ -32,10 +32,9 @@ from browser import Browser  # noqa: E402
 
 from smp_motor_control import WHEELS, get_controller_name  # noqa: E402
 from smp_motor_control.motor.file import PAPER_MOTORS, find_config  # noqa: E402
-from smp_motor_control.nodes import loopback  # noqa: E402
-from smp_motor_control.nodes.driving import drive_body  # noqa: E402
+from smp_motor_control.nodes.driving import drive_wheels  # noqa: E402
 from smp_motor_ident.cli import applying, demonstration, driving, steps  # noqa: E402
-from smp_motor_ident.cli.processes import Processes, connect, free_domain  # noqa: E402
+from smp_motor_ident.cli.processes import Processes, connect, isolate  # noqa: E402
 
 TICKS = os.sysconf("SC_CLK_TCK")
 
@@ -104,7 +103,7 @@ def main() -> int:
     parser.add_argument("--seconds", type=float, default=20.0)
     parser.add_argument("--turns", type=int, default=2)
     arguments = parser.parse_args()
-    os.environ.update({"ROS_DOMAIN_ID": str(free_domain()), **loopback.loopback_environment()})
+    isolate(None)
     turns: dict[bool, list[Turn]] = {False: [], True: []}
     with (
         tempfile.TemporaryDirectory() as name,
@@ -117,16 +116,16 @@ def main() -> int:
         gains = applying.from_file(find_config("gains.yaml"))
         client.set_parameters({get_controller_name(w): values for w, values in gains.items()})
         robot.switch("activate")
-        plan = [("straight", 0.2, 0.0, arguments.seconds)]
+        plan = [("forward", 2.0, arguments.seconds)]
         for k in range(2 * arguments.turns):
             page = bool(k % 2)
             turn = Turn(np.zeros(0))
             bag = steps.record(robot, f"drive_{k}", "pid_state")
             if page:
                 with watched(folder / f"lab_{k}", turn, arguments.seconds):
-                    drive_body(client, plan, WHEELS)
+                    drive_wheels(client, plan, WHEELS)
             else:
-                drive_body(client, plan, WHEELS)
+                drive_wheels(client, plan, WHEELS)
             processes.stop("record")
             drive = driving.read_drive(bag, WHEELS)
             turn.ages = np.concatenate([one.answers.columns["age"] for one in drive.values()])

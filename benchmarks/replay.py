@@ -57,8 +57,9 @@ def main(folder: Path) -> int:
     try:
         until(lambda: len(heard) == len(offline), 120.0)
         before, begun = seconds_of(identifier.pid), time.monotonic()
-        play = subprocess.Popen(["play", str(folder / "excitation")])
-        until(lambda: play.poll() is not None, 600.0)
+        for bag in sorted((folder / "excitation").iterdir()):
+            play = subprocess.Popen(["play", str(bag)])
+            until(lambda play=play: play.poll() is not None, 600.0)
         share = (seconds_of(identifier.pid) - before) / (time.monotonic() - begun)
         print(f"identifier took {100 * share:.1f} % of a processor (load {os.getloadavg()[0]:.1f})")
         # An estimate under way is of an earlier window: quiet for a minute is the end.

@@ -1,12 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Timed drives of the body or, without skid_steer, of the wheels; each ends with zero commands."""
+"""Timed drive of the wheels, which ends with zero set-points."""
 
 import time
 from collections.abc import Callable, Sequence
-from typing import Any
 
-from geometry_msgs.msg import TwistStamped
-from rclpy.publisher import Publisher
 from sensor_msgs.msg import JointState
 
 from smp_interfaces.msg import PidState
@@ -18,32 +15,11 @@ COMMAND_PERIOD_S = 0.02
 STANDSTILL_S = 1.0  # minimum standstill before a drive
 QUIET_TIME_S = 0.5  # time without set-points of other nodes before a drive
 
-Times = list[tuple[str, float, float]]
-"""Name, start and end of each segment by the stamps [s]."""
-
-
-def drive_body(
-    client: RobotClient, segments: Sequence[tuple[str, float, float, float]], wheels: Sequence[str]
-) -> Times:
-    """Drive segments of (name, m/s, rad/s, s) and stop in any case."""
-    publisher = client.node.create_publisher(TwistStamped, "cmd_vel", 1)
-
-    def send(linear: float, angular: float) -> None:
-        message = TwistStamped()
-        message.header.stamp = client.node.get_clock().now().to_msg()
-        message.header.frame_id = "base_link"
-        message.twist.linear.x, message.twist.angular.z = float(linear), float(angular)
-        publisher.publish(message)
-
-    if not client.until(lambda: publisher.get_subscription_count() > 0, TIMEOUT_S):
-        raise RobotError(f"{publisher.topic_name} has no subscriber; start skid_steer")
-    return _run_segments(client, publisher, send, segments, wheels)
-
 
 def drive_wheels(
     client: RobotClient, steps: Sequence[tuple[str, float, float]], wheels: Sequence[str]
-) -> Times:
-    """Drive all wheels through steps of (name, rad/s, s) and stop in any case."""
+) -> None:
+    """Drive all wheels, from standstill, through steps of (name, rad/s, s); stop in any case."""
     _refuse_other_senders(client)
     publisher = client.node.create_publisher(JointState, "wheel_setpoints", STREAM_PUBLISHER)
     message = JointState(name=[get_joint_name(wheel) for wheel in wheels])
@@ -53,33 +29,18 @@ def drive_wheels(
         message.velocity = [float(speed)] * len(wheels)
         publisher.publish(message)
 
-    return _run_segments(client, publisher, send, steps, wheels)
-
-
-def _run_segments(
-    client: RobotClient,
-    publisher: Publisher,
-    send: Callable[..., None],
-    segments: Sequence[tuple[Any, ...]],
-    wheels: Sequence[str],
-) -> Times:
-    """Send the values of segments (name, values ..., s) after a standstill."""
-    zero = [0.0] * (len(segments[0]) - 2)
-    times = []
     try:
-        _command_standstill(client, lambda: send(*zero), wheels)
-        for name, *values, duration in segments:
-            begin, end = _now(client), time.monotonic() + duration
+        _command_standstill(client, lambda: send(0.0), wheels)
+        for _, speed, duration in steps:
+            end = time.monotonic() + duration
             while (left := end - time.monotonic()) > 0:
-                send(*values)
+                send(speed)
                 client.spin(min(COMMAND_PERIOD_S, left))
-            times.append((name, begin, _now(client)))
     finally:
         for _ in range(3):
-            send(*zero)
+            send(0.0)
             client.spin(COMMAND_PERIOD_S)
         client.node.destroy_publisher(publisher)
-    return times
 
 
 def _command_standstill(
@@ -102,10 +63,6 @@ def _command_standstill(
                 )
             send_zero()
             client.spin(COMMAND_PERIOD_S)
-
-
-def _now(client: RobotClient) -> float:
-    return float(client.node.get_clock().now().nanoseconds * 1e-9)
 
 
 def _refuse_other_senders(client: RobotClient) -> None:

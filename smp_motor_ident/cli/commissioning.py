@@ -18,7 +18,16 @@ from smp_motor_control import WHEELS
 from smp_motor_control.motor.file import load_motors
 from smp_motor_control.wheel.protection import Bounds
 from smp_motor_ident.bag.read import read_experiments
-from smp_motor_ident.cli import checking, commission, commissioning_log, driving, plan, steps
+from smp_motor_ident.cli import (
+    checking,
+    commission,
+    commissioning_log,
+    driving,
+    identify,
+    plan,
+    steps,
+    tune,
+)
 from smp_motor_ident.cli.commissioning_log import CommissioningLog
 from smp_motor_ident.cli.processes import ProcessError, Processes, connect
 from smp_motor_ident.commission import validation_run, winding
@@ -191,7 +200,7 @@ def _record(session: Session, one: plan.Recording) -> None:
     shutil.rmtree(draft, ignore_errors=True)
     try:
         steps.record(robot, UNFINISHED)
-        steps.excite(robot, [one.excitation])
+        steps.excite(robot, one.excitation)
     finally:
         robot.processes.stop("excite", "record")
     log = session.log
@@ -242,7 +251,8 @@ def _design(session: Session) -> driving.DesignSet:
     if not log.has("tuned"):
         session.begin(plan.TUNING)
         accepted = ["--accept-unreliable"] if UNRELIABLE in arguments.accept else []
-        steps.tune_wheels(folder / "identification", gains, "--force", *accepted)
+        results = str(folder / "identification")
+        steps.run(tune, results, "--output", str(gains), "--force", *accepted)
         log.mark(tuned=True)
         log.write()
     return driving.read_designs(estimates, gains)
@@ -255,11 +265,13 @@ def _identify(session: Session, part: str) -> dict[str, Estimate]:
     if log.has("identified"):
         return read_identification(results)
     session.begin(part)
-    options = ["--force", "--quiet", "--accept-unreliable", "--validate"]
-    options.append(str(robot.folder / plan.HELD_OUT))
-    options += [part for wheel in robot.wheels for part in ("--wheel", wheel)]
+    fitted, held_out = (str(robot.folder / name) for name in (plan.FITTED, plan.HELD_OUT))
+    wheels = [part for wheel in robot.wheels for part in ("--wheel", wheel)]
     try:
-        estimates = steps.identify_wheels(robot.folder / plan.FITTED, results, *options)
+        steps.run(
+            identify, fitted, "--output", str(results), "--validate", held_out, *wheels,
+            "--force", "--quiet", "--accept-unreliable",
+        )  # fmt: skip
     except ProcessError:
         if (results / "identification.json").is_file():
             log.stop_on(
@@ -268,7 +280,7 @@ def _identify(session: Session, part: str) -> dict[str, Estimate]:
         raise
     log.mark(identified=True, judged=False, tuned=False)
     log.write()
-    return estimates
+    return read_identification(results)
 
 
 def _verify(session: Session, designed: driving.DesignSet) -> str:

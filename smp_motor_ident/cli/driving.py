@@ -20,14 +20,17 @@ from smp_motor_ident.cli import applying, steps
 from smp_motor_ident.cli.processes import ProcessError
 from smp_motor_ident.finding import Finding
 from smp_motor_ident.record import Hardware
-from smp_motor_ident.report.drawing import Chart, Curve, document
 from smp_motor_ident.result import Estimate
 from smp_motor_ident.tune import verification
 from smp_motor_ident.tune.verification import STEADY_TIME_S, Change
 
-MIN_CHANGE = 0.8  # smallest change of set-point that is judged [rad/s, wheel]
+RECORDING = "verification"  # folder of the recorded drive
 LEAD_S = 0.3  # rest before a drive that is simulated with it [s]
 MAX_SAMPLES = 1e6  # largest number of samples of a drive; its simulation takes seconds
+
+Plan = Sequence[tuple[str, float, float]]
+"""Steps of a drive: name, set-point [rad/s, wheel] and duration [s]."""
+
 STATE_COLUMNS = ("encoder_count", "position", "voltage")
 ANSWER_COLUMNS = ("setpoint", "age", "dt", "output")
 MIN_STEP_S = 1.0  # shortest duration of a set-point in a drive [s]
@@ -57,17 +60,6 @@ class DriveRecording:
     answers: Table
 
 
-@dataclass(frozen=True)
-class Move:
-    """One change of set-point in a drive."""
-
-    name: str
-    begin: float  # time of the first report at the new set-point [s]
-    before: float  # set-point until then [rad/s, wheel]
-    setpoint: float  # [rad/s, wheel]
-    lasts: float  # [s]
-
-
 def read_drive(bag: Path, wheels: Sequence[str], namespace: str = "") -> dict[str, DriveRecording]:
     """Read the samples of wheels and the answers of their controllers."""
     wanted = {f"{namespace}/{wheel}/motor_state": list(STATE_COLUMNS) for wheel in wheels}
@@ -79,27 +71,10 @@ def read_drive(bag: Path, wheels: Sequence[str], namespace: str = "") -> dict[st
     }
 
 
-def find_moves(segments: Sequence[tuple[str, float, float]], answers: Table) -> list[Move]:
-    """Return the changes of one wheel's set-point in a drive by segments of name, begin and end."""
-    seconds, asked = answers.seconds, answers.columns["setpoint"]
-    moves = []
-    for name, begin, end in segments:
-        during = np.flatnonzero((seconds > begin) & (seconds < end))
-        if during.size == 0:
-            continue
-        final = asked[during[-1]]
-        first = during[np.argmax(asked[during] == final)]
-        before = float(asked[max(first - 1, 0)])
-        if abs(final - before) >= MIN_CHANGE:
-            at = float(seconds[first])
-            moves.append(Move(name, at, before, float(final), end - at))
-    return moves
-
-
-def evaluate_changes(
-    wheel: str, driven: DriveRecording, moves: Sequence[Move], given: DesignSet
+def read_changes(
+    wheel: str, driven: DriveRecording, plan: Plan, given: DesignSet
 ) -> tuple[list[Change], float]:
-    """Return the changes of one wheel, and its longest wait for an answer [s]."""
+    """Return a wheel's changes of set-point from rest, and its longest wait for an answer [s]."""
     state, answers = driven.state, driven.answers
     estimate, entry = given.estimates[wheel], given.document[wheel]
     delays = verification.measure_arrival_delays(
@@ -110,9 +85,12 @@ def evaluate_changes(
     # The first interval began before this drive.
     late = answers.columns["dt"][1:], delays[1:]
     silence = max(float(np.max(one, initial=0.0)) for one in late)
-    if not moves:
-        return [], silence
-    end = max(one.begin + one.lasts for one in moves)
+    moves = [
+        (name, setpoint, _find_begin(wheel, setpoint, answers), lasts)
+        for name, setpoint, lasts in plan
+        if setpoint
+    ]
+    end = max(begin + lasts for *_, begin, lasts in moves)
     shown = (state.seconds > answers.seconds[0] - LEAD_S) & (state.seconds < end)
     instants = state.seconds[shown]
     known = dict(zip(answers.seconds, delays))
@@ -136,46 +114,14 @@ def evaluate_changes(
     count = 2 * np.pi / (hardware.counts_per_revolution or 1e6) / hardware.gear_ratio
     unsure = verification.resolution(count, step)
     changes = []
-    for one in moves:
-        since = even - one.begin
-        kept = (since >= 0.0) & (since < one.lasts - 0.05)
+    for name, setpoint, begin, lasts in moves:
+        since = even - begin
+        kept = (since >= 0.0) & (since < lasts - 0.05)
         changes.append(verification.read_change(
-            wheel, one.name, one.setpoint, since[kept], speed[kept], rows[:, kept],
-            entry["specification"], unsure, before=one.before,
+            wheel, name, setpoint, since[kept], speed[kept], rows[:, kept],
+            entry["specification"], unsure,
         ))  # fmt: skip
     return changes, silence
-
-
-def draw_drive(
-    drive: Mapping[str, DriveRecording],
-    sides: Mapping[str, Sequence[str]],
-    hardware: Mapping[str, Hardware],
-) -> str:
-    """Return an SVG file of set-points and speeds of the wheels of each side."""
-    wheels = list(hardware)
-    begin = min(float(one.state.seconds[0]) for one in drive.values())
-    charts = []
-    for side, names in sides.items():
-        asked = drive[names[0]].answers
-        time = asked.seconds
-        speeds = {w: compute_wheel_speed(drive[w].state, hardware[w]) for w in names}
-        curves = [Curve("set-point", asked.columns["setpoint"], "muted")]
-        curves += [
-            Curve(w, np.interp(time, *speeds[w]), f"wheel-{wheels.index(w) % 4 + 1}") for w in names
-        ]
-        title = f"Wheels of the {side} side, and their set-point (grey)"
-        charts.append(Chart(
-            name=side, title=title, x_label="time [s]", y_label="wheel speed [rad/s]",
-            x=time - begin, curves=tuple(curves),
-        ))  # fmt: skip
-    return document(charts, wheels)
-
-
-def find_longest_stall(drive: Mapping[str, DriveRecording]) -> float:
-    """Return the longest pause of the simulating machine [s]."""
-    gaps = (float(np.max(np.diff(one.state.seconds))) for one in drive.values())
-    ages = (float(np.max(one.answers.columns["age"])) for one in drive.values())
-    return max(*gaps, *ages)
 
 
 def compute_wheel_angle(state: Table, hardware: Hardware) -> Array:
@@ -185,13 +131,6 @@ def compute_wheel_angle(state: Table, hardware: Hardware) -> Array:
     angle_per_count = 2 * np.pi / hardware.counts_per_revolution / hardware.gear_ratio
     counts = unwrap(state.columns["encoder_count"], hardware.encoder_bits).astype(np.float64)
     return angle_per_count * counts
-
-
-def compute_wheel_speed(state: Table, hardware: Hardware) -> tuple[Array, Array]:
-    """Return times and speed of a wheel from its encoder."""
-    angle = compute_wheel_angle(state, hardware)
-    step = float(np.median(np.diff(state.seconds)))
-    return verification.smooth_speed(state.seconds, angle - angle[0], step)
 
 
 class NoMessageError(ProcessError):
@@ -221,8 +160,8 @@ def on_trial(client: Any, gains: Mapping[str, Mapping[str, Any]]) -> Iterator[Tr
         client.set_pending_restore(**pending_restore)
 
 
-def plan_drive(designed: DesignSet) -> list[tuple[str, float, float]]:
-    """Return the steps of the drive: name, set-point [rad/s] and duration [s]."""
+def plan_drive(designed: DesignSet) -> Plan:
+    """Return the steps of the drive, long enough for every wheel to settle."""
     specified = [one["specification"] for one in designed.document.values()]
     change = min(float(one["change"]) for one in specified)
     longest = max(float(one["settling"]["high"] or MIN_STEP_S) for one in specified)
@@ -231,15 +170,14 @@ def plan_drive(designed: DesignSet) -> list[tuple[str, float, float]]:
     return [("stand", 0.0, 2 * LEAD_S), *((name, speed, lasts) for name, speed in driven)]
 
 
-def drive(robot: steps.Robot, plan: Sequence[tuple[str, float, float]]) -> Path:
+def drive(robot: steps.Robot, plan: Plan) -> Path:
     """Drive all wheels through a plan with the gains that are set; return the recording."""
     from smp_motor_control.nodes.driving import drive_wheels
 
-    bag = robot.folder / "verification"
-    shutil.rmtree(bag, ignore_errors=True)
+    shutil.rmtree(robot.folder / RECORDING, ignore_errors=True)
     try:
         robot.switch("activate")
-        steps.record(robot, bag.name, "motor_command", "pid_state")
+        bag = steps.record(robot, RECORDING, "motor_command", "pid_state")
         drive_wheels(robot.client, plan, robot.wheels)
     finally:
         robot.processes.stop("record")
@@ -254,13 +192,16 @@ def drive_undisturbed(
     plan, namespace = plan_drive(designed), str(robot.client.node.get_namespace()).rstrip("/")
     for left in reversed(range(MAX_ATTEMPTS)):
         say(f"driving on the new gains: {', '.join(name for name, *_ in plan)}")
+        driven = read_drive(drive(robot, plan), list(designed.document), namespace)
         try:
-            changes, silence = read_changes(drive(robot, plan), plan, designed, namespace)
+            read = [read_changes(wheel, one, plan, designed) for wheel, one in driven.items()]
         except NoMessageError as error:
             if not left:
                 raise
             say(f"the drive was disturbed: {error}")
             continue
+        changes = [change for found, _ in read for change in found]
+        silence = max(waited for _, waited in read)
         late = verification.report_silence(silence) or verification.report_loop_delay(changes)
         judged = verification.judge(changes)
         if not (late and (judged or late[0].severity == "refused")):
@@ -269,24 +210,7 @@ def drive_undisturbed(
     return changes, [*late, *judged]
 
 
-def read_changes(
-    bag: Path, plan: Sequence[tuple[str, float, float]], designed: DesignSet, namespace: str
-) -> tuple[list[Change], float]:
-    """Return every change from rest, and the longest wait of a wheel for an answer [s]."""
-    changes, silence = list[Change](), 0.0
-    for wheel, driven in read_drive(bag, list(designed.document), namespace).items():
-        moves = [
-            Move(name, _begin(wheel, setpoint, driven.answers), 0.0, setpoint, lasts)
-            for name, setpoint, lasts in plan
-            if setpoint
-        ]
-        found, waited = evaluate_changes(wheel, driven, moves, designed)
-        changes += found
-        silence = max(silence, waited)
-    return changes, silence
-
-
-def _begin(wheel: str, setpoint: float, answers: Table) -> float:
+def _find_begin(wheel: str, setpoint: float, answers: Table) -> float:
     """Return the time of a wheel's first message at a set-point."""
     asked = np.flatnonzero(np.isclose(answers.columns["setpoint"], setpoint))
     if not asked.size:

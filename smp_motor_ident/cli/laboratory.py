@@ -8,7 +8,6 @@ import argparse
 import itertools
 import math
 import multiprocessing
-import os
 import queue
 import time
 from collections.abc import Callable, Mapping
@@ -26,9 +25,8 @@ from smp_motor_control.arrays import Array
 from smp_motor_control.errors import SmpError
 from smp_motor_control.excitation import SIGNALS
 from smp_motor_control.motor import Motor, MotorParameters
-from smp_motor_control.nodes import loopback
 from smp_motor_ident.cli import demonstration, interruption, lab, lab_designs, steps
-from smp_motor_ident.cli.processes import ProcessError, Processes, connect, free_domain
+from smp_motor_ident.cli.processes import ProcessError, Processes, connect, isolate
 from smp_motor_ident.errors import ParameterError
 from smp_motor_ident.report import words
 from smp_motor_ident.report.document import read_identification
@@ -52,8 +50,7 @@ def work(arguments: argparse.Namespace) -> int:
     if folder.exists():
         raise ParameterError(f"{folder}: exists already; choose another --output")
     if arguments.demo:
-        domain = free_domain() if arguments.domain is None else arguments.domain
-        os.environ.update({"ROS_DOMAIN_ID": str(domain), **loopback.loopback_environment()})
+        isolate(arguments.domain)
     ros = tuple(arguments.ros_arguments)
     bounds = {"max_speed": arguments.max_speed, "max_current": arguments.max_current}
     with (
@@ -298,9 +295,9 @@ class Laboratory:
             steps.record(self.robot, name)
             self._wait(lambda: True, moving=True)
             begun = time.monotonic()
-            plan = [steps.Excitation(str(asked["signal"]), duration, amplitude)]
+            signal = steps.Excitation(str(asked["signal"]), duration, amplitude)
             moved = replace(self.robot, wheels=tuple(wheels), bounds=bounds)
-            steps.excite(moved, plan, lambda: self._wait(has_ended, moving=True))
+            steps.excite(moved, signal, lambda: self._wait(has_ended, moving=True))
         finally:
             processes.stop("excite", "record")
         self._recorded[name] = wheels

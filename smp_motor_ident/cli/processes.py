@@ -16,8 +16,11 @@ from typing import IO, Any
 
 from smp_motor_control.entry import find_domain_problem
 from smp_motor_control.errors import SmpError
+from smp_motor_control.nodes import loopback
 from smp_motor_ident.cli import interruption, workers
 from smp_motor_ident.errors import ParameterError
+
+FREE_DOMAINS = range(215, 233)  # ROS domains for simulated robots
 
 
 class ProcessError(SmpError):
@@ -45,22 +48,29 @@ def connect(name: str, ros_arguments: Sequence[str] = ()) -> Iterator[Any]:
         yield client
 
 
-def free_domain(first: int = 215, last: int = 232) -> int:
+def isolate(domain: int | None) -> int:
+    """Restrict ROS to this computer and a domain, by default a free one; return the domain."""
+    chosen = _find_free_domain() if domain is None else domain
+    os.environ.update({"ROS_DOMAIN_ID": str(chosen), **loopback.loopback_environment()})
+    return chosen
+
+
+def _find_free_domain() -> int:
     """Claim a ROS domain that is unused on this machine, until this process ends.
 
     References
     ----------
     DDSI-RTPS 2.5, section 9.6.1.1: port 7400 + 250 domain + 10 belongs to participant 0.
     """
-    count = last - first + 1
-    for k in range(count):
-        domain = first + (os.getpid() + k) % count
+    for k in range(len(FREE_DOMAINS)):
+        domain = FREE_DOMAINS[(os.getpid() + k) % len(FREE_DOMAINS)]
         if not _claim(domain):
             continue
         probe = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         with probe, contextlib.suppress(OSError):
             probe.bind(("", 7400 + 250 * domain + 10))
             return domain
+    first, last = FREE_DOMAINS[0], FREE_DOMAINS[-1]
     raise ProcessError(f"all ROS domains from {first} to {last} are in use; end one of their users")
 
 

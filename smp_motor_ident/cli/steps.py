@@ -1,17 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Steps from a running robot to tuned wheels, shared by demo and commission."""
+"""Steps of the tools that work on a running robot: record, excite, run another tool."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 from smp_motor_control import get_controller_name
 from smp_motor_ident.bag import writer  # noqa: F401  (a missing package is reported at once)
-from smp_motor_ident.cli import identify, tables, tune  # noqa: F401
+from smp_motor_ident.cli import tables  # noqa: F401
+from smp_motor_ident.cli.frame import INTERRUPTED
 from smp_motor_ident.cli.processes import ProcessError, Processes
-from smp_motor_ident.report.document import read_identification
-from smp_motor_ident.result import Estimate
 
 
 @dataclass(frozen=True)
@@ -70,36 +70,24 @@ def record(robot: Robot, name: str, *shown: str) -> Path:
     return bag
 
 
-def excite(
-    robot: Robot, plan: Sequence[Excitation], wait: Callable[[], None] = lambda: None
-) -> None:
-    """Excite all wheels by one signal after the other; ``wait`` is called during each."""
-    for part in plan:
-        parameters: dict[str, object] = {
-            "signal": part.signal, "wheels": f"[{', '.join(robot.wheels)}]",
-            "amplitude": float(part.amplitude), "duration": float(part.duration), **robot.bounds,
-        }  # fmt: skip
-        if part.band:
-            parameters["lowest"], parameters["highest"] = part.band
-        arguments = [a for n, v in parameters.items() for a in ("-p", f"{n}:={v}")]
-        robot.processes.start("excite", "excite", *robot.ros_arguments, "--ros-args", *arguments)
-        wait()
-        robot.processes.wait("excite", part.duration + TIMEOUT_S)
+def excite(robot: Robot, one: Excitation, wait: Callable[[], None] = lambda: None) -> None:
+    """Excite all wheels by a signal; ``wait`` is called meanwhile."""
+    parameters: dict[str, object] = {
+        "signal": one.signal, "wheels": f"[{', '.join(robot.wheels)}]",
+        "amplitude": float(one.amplitude), "duration": float(one.duration), **robot.bounds,
+    }  # fmt: skip
+    if one.band:
+        parameters["lowest"], parameters["highest"] = one.band
+    arguments = [a for n, v in parameters.items() for a in ("-p", f"{n}:={v}")]
+    robot.processes.start("excite", "excite", *robot.ros_arguments, "--ros-args", *arguments)
+    wait()
+    robot.processes.wait("excite", one.duration + TIMEOUT_S)
 
 
-def identify_wheels(bag: Path, output: Path, *options: str) -> dict[str, Estimate]:
-    """Run ``identify`` on a bag."""
-    _require_success("identify", identify.main([str(bag), "--output", str(output), *options]))
-    return read_identification(output)
-
-
-def tune_wheels(identified: Path, output: Path, *options: str) -> None:
-    """Run ``tune`` on an identification."""
-    _require_success("tune", tune.main([str(identified), "--output", str(output), *options]))
-
-
-def _require_success(tool: str, code: int) -> None:
-    if code == 130:
+def run(tool: ModuleType, *arguments: str) -> None:
+    """Run a command-line tool in this process; raise ProcessError unless it succeeds."""
+    code, name = tool.main(arguments), tool.__name__.rpartition(".")[2]
+    if code == INTERRUPTED:
         raise KeyboardInterrupt
     if code != 0:
-        raise ProcessError(f"{tool} ended with exit code {code}; its messages are above")
+        raise ProcessError(f"{name} ended with exit code {code}; its messages are above")

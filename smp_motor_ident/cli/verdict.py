@@ -73,7 +73,7 @@ def print_results(
         shares = (f"{n} {words.systematic(q)}" for n, _, q in compared if q.systematic)
         mine = designed.gains[wheel]
         text = ", ".join(f"{n} {mine[n]:.4g}" for n in GAINS if mine.get(n))
-        columns = ("manoeuvre", "to", "settling", "predicted", "overshoot", "predicted")
+        columns = ("change", "to", "settling", "predicted", "overshoot", "predicted")
         driven = table("", *columns)
         for one in changes[wheel]:
             pairs = (one.reading, one.expected)

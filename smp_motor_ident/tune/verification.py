@@ -230,18 +230,17 @@ def _limit(readings: Sequence[float]) -> float:
 
 def read_change(
     wheel: str, name: str, setpoint: float, time: Array, speed: Array, rows: Array,
-    specification: Mapping[str, Any], unsure: float, before: float = 0.0,
+    specification: Mapping[str, Any], unsure: float,
 ) -> Change:  # fmt: skip
-    """Return a change from a speed ``before`` it [rad/s], with its reading and its bands."""
-    moved, change = speed - before, setpoint - before
+    """Return a change from rest, with its reading and its bands."""
     # The planned overshoot does not count as unsettled.
-    tolerance = SETTLING_BAND + MAX_PLANNED_OVERSHOOT + RESOLUTION_SIGMAS * unsure / abs(change)
-    expected = read(time, rows[0] - before, change, tolerance)
+    tolerance = SETTLING_BAND + MAX_PLANNED_OVERSHOOT + RESOLUTION_SIGMAS * unsure / abs(setpoint)
+    expected = read(time, rows[0], setpoint, tolerance)
     return Change(
         wheel, name, setpoint, time, speed, rows.min(axis=0), rows[0], rows.max(axis=0),
-        read(time, moved, change, tolerance),
+        read(time, speed, setpoint, tolerance),
         expected,
-        compute_bands(rows - before, time, change, specification, unsure),
+        compute_bands(rows, time, setpoint, specification, unsure),
         tolerance,
         expected.overshoot
         - _read_limit(specification, "overshoot")

@@ -6,20 +6,21 @@ import shutil
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import pytest
 from client import Client
 from results import estimate as make_estimate
 
-from smp_motor_ident.cli import checking, commissioning, plan, steps
+from smp_motor_ident.cli import checking, commissioning, plan, steps, tune
 from smp_motor_ident.cli.commission import main
 from smp_motor_ident.cli.processes import ProcessError
 from smp_motor_ident.commission.wheel_test import Figures
 from smp_motor_ident.finding import Finding
 from smp_motor_ident.report.commissioning import GAINS
 from smp_motor_ident.report.document import identification_document
-from smp_motor_ident.result import Estimate, to_json
+from smp_motor_ident.result import to_json
 
 
 def test_dry_run_prints_the_plan_and_creates_no_files(tmp_path, capsys):
@@ -65,8 +66,7 @@ class Steps:
             (commissioning, "verify", "_verify"),
         ):
             monkeypatch.setattr(owner, called, partial(self.step, name))
-        monkeypatch.setattr(steps, "identify_wheels", self.identify)
-        monkeypatch.setattr(steps, "tune_wheels", self.tune)
+        monkeypatch.setattr(steps, "run", self.run)
         monkeypatch.setattr(checking, "check_wheels", self.check)
         monkeypatch.setattr(commissioning, "find_hot_windings", lambda *_: self.heat)
 
@@ -83,16 +83,18 @@ class Steps:
         if name == self.cut or self.left < 0:
             raise KeyboardInterrupt
         if name == "excite":
-            self.sent += given[1]
+            self.sent.append(given[1])
         return {"validate": [], "verify": "as designed"}.get(name)
 
-    def identify(self, bag: Path, output: Path, *_: str) -> dict[str, Estimate]:
+    def run(self, tool: ModuleType, *arguments: str) -> None:
+        if tool is tune:
+            self.tune(*arguments)
+            return
         self.step("identify")
-        estimates = {"left": self.estimate}
+        output = self.folder / "identification"
         output.mkdir(exist_ok=True)
-        text = to_json(identification_document(estimates))
+        text = to_json(identification_document({"left": self.estimate}))
         (output / "identification.json").write_text(text)
-        return estimates
 
     def check(self, *_: object) -> checking.CheckResult:
         self.step("check")
@@ -102,8 +104,9 @@ class Steps:
         (self.folder / name).mkdir()  # as record does, which refuses an existing folder
         return self.folder / name
 
-    def tune(self, *_: object) -> None:
+    def tune(self, *arguments: str) -> None:
         self.step("tune")
+        self.tuned_with = arguments
         most = {"value": 0.1, "high": 0.15}
         entry = {"gains": dict.fromkeys((name for name, _ in GAINS), 1.0)}
         entry["specification"] = {"settling": most, "overshoot": most}
@@ -188,18 +191,15 @@ def test_apply_without_a_controller_is_refused_before_motion(robot, capsys, monk
     assert told.index("one is started") < told.index("exciting: sine")
 
 
-def test_design_on_unreliable_identification_requires_acceptance(robot, monkeypatch):
+def test_design_on_unreliable_identification_requires_acceptance(robot):
     grave = Finding("lag", "unreliable", "the gain may be off", {}, "record longer")
     robot.estimate = replace(robot.estimate, findings=(grave,))
-    tuned = list[str]()
-    tune = robot.tune
-    monkeypatch.setattr(steps, "tune_wheels", lambda *given: (tuned.extend(given[2:]), tune()))
     assert main(robot.given) == 1
     page = (robot.folder / "report.html").read_text()
     assert "the gain may be off" in page and "Not passed." in page
     robot.done = []
     assert main([*robot.given, "--resume", "--accept", "unreliable_identification"]) == 0
-    assert robot.done == ["tune", "verify"] and "--accept-unreliable" in tuned
+    assert robot.done == ["tune", "verify"] and "--accept-unreliable" in robot.tuned_with
     assert "Passed with accepted findings." in (robot.folder / "report.html").read_text()
 
 
@@ -231,7 +231,7 @@ def test_failure_reason_is_stored_in_the_verdict(robot, monkeypatch):
     def refuse(*_: object) -> None:
         raise ProcessError("left/wheel_pid refused the parameters")
 
-    monkeypatch.setattr(steps, "tune_wheels", refuse)
+    monkeypatch.setattr(robot, "tune", refuse)
     assert main(robot.given) == 1
     document = json.loads((robot.folder / "commissioning.json").read_text())
     assert document["passed"] is False and "refused the parameters" in document["verdict"]

@@ -3,7 +3,6 @@
 
 import json
 import math
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -52,9 +51,8 @@ class Robot:
         self.draft = robot.folder / name
         self.draft.mkdir()  # left behind by an interruption
 
-    def excite(self, robot: steps.Robot, plan: Sequence[steps.Excitation]) -> None:
+    def excite(self, robot: steps.Robot, part: steps.Excitation) -> None:
         self.use()
-        (part,) = plan
         n = round(part.duration * RATE)
         sent = SIGNALS[part.signal](amplitude=part.amplitude)(np.arange(n) / RATE)
         held = np.concatenate([np.zeros(1), sent])

@@ -1,9 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Set-point changes in a recorded drive: detection, and evaluation against the design."""
+"""Set-point changes in a recorded drive, evaluated against the design."""
 
 import json
 import math
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -18,7 +17,10 @@ from smp_motor_ident.cli.tuning import read_estimates
 from smp_motor_ident.tune import verification
 
 WHEEL, STEP, LASTS = "front_left", 0.005, 1.0
-SEGMENTS = [("stand", 0.0), ("straight", 2.0), ("arc", 1.0), ("spin", -2.0), ("stop", 0.0)]
+PLAN = [
+    (name, speed, LASTS)
+    for name, speed in (("stand", 0.0), ("forward", 2.0), ("stop", 0.0), ("reverse", -1.0))
+]
 
 
 def table(time: np.ndarray, **columns: np.ndarray) -> Table:
@@ -34,7 +36,7 @@ def test_measured_settling_of_a_simulated_drive_matches_the_design(tmp_path):
     assert stated["common"]  # four wheels, one transition
 
     entry = load_motors(motors)[WHEEL]
-    asked = [speed for _, speed in SEGMENTS]
+    asked = [speed for _, speed, _ in PLAN]
     run = simulate_closed_loop(
         entry,
         verification.loop_settings(given.gains[WHEEL]),
@@ -48,15 +50,8 @@ def test_measured_settling_of_a_simulated_drive_matches_the_design(tmp_path):
     setpoints = np.array([asked[min(int(t / LASTS), len(asked) - 1)] for t in run.time])
     steps = np.full(run.time.size, STEP)
     answers = table(run.time, setpoint=setpoints, output=none, age=steps, dt=steps)
-    # A segment begins when it is sent, 12 ms before the wheel receives it.
-    segments = [(name, k * LASTS - 0.012, (k + 1) * LASTS) for k, (name, _) in enumerate(SEGMENTS)]
-    moves = driving.find_moves(segments, answers)
-    assert [(m.name, m.before, m.setpoint) for m in moves] == [
-        ("straight", 0.0, 2.0), ("arc", 2.0, 1.0), ("spin", 1.0, -2.0), ("stop", -2.0, 0.0),
-    ]  # fmt: skip
-    changes, _ = driving.evaluate_changes(
-        WHEEL, driving.DriveRecording(state, answers), moves, given
-    )
+    changes, _ = driving.read_changes(WHEEL, driving.DriveRecording(state, answers), PLAN, given)
+    assert [(one.name, one.setpoint) for one in changes] == [("forward", 2.0), ("reverse", -1.0)]
     for one in changes:
         # Tolerance of two samples: another size of change, and speed from counts.
         assert abs(one.reading.settling - stated["value"]) <= 2 * STEP
@@ -64,11 +59,10 @@ def test_measured_settling_of_a_simulated_drive_matches_the_design(tmp_path):
         assert one.reading.overshoot < 1.0
     # A lagging wheel is detected: the same drive, 0.1 s late.
     late = driving.DriveRecording(table(run.time + 0.1, **state.columns), answers)
-    (behind, *_), _ = driving.evaluate_changes(WHEEL, late, moves, given)
+    (behind, *_), _ = driving.read_changes(WHEEL, late, PLAN, given)
     assert behind.reading.settling - stated["value"] > 0.05
     # A clock step during the drive gives one error line and allocates no samples for the gap.
     early = np.where(run.time < 0.5, 0.0, 1.7e9) + run.time
     torn = driving.DriveRecording(table(early, **state.columns), table(early, **answers.columns))
-    wide = [replace(one, begin=one.begin + 1.7e9) for one in moves]
     with pytest.raises(ProcessError, match="a clock was set"):
-        driving.evaluate_changes(WHEEL, torn, wide, given)
+        driving.read_changes(WHEEL, torn, PLAN, given)
