@@ -2,9 +2,9 @@
 """Single-threaded executor for control loops that takes a third of the stock executor's time.
 
 The stock executor rebuilds its wait set and wraps every callback in a task for each message.
-This one rebuilds the wait set only when an entity is created or destroyed and calls plain
-callbacks of subscriptions and timers directly; coroutines and other entities are handled as in
-the stock executor.  While messages arrive in quick succession it waits for messages, timers and
+This one rebuilds the wait set only when an entity is created or destroyed and calls the callbacks
+of subscriptions and timers directly; other entities, and coroutines, are left to the stock
+executor.  While messages arrive in quick succession it waits for messages, timers and
 guard conditions only, and checks the other entities every :data:`SERVICE_PERIOD_NS`.
 """
 
@@ -109,7 +109,6 @@ class LeanExecutor(SingleThreadedExecutor):
         super().__init__(**options)
         self._waits: tuple[_WaitSet, _WaitSet] | None = None
         self._stream_until = self._last_message_at = 0
-        self._plain: dict[Any, bool] = {}
 
     def entities(self) -> tuple[tuple[Any, ...], ...]:
         nodes = self.get_nodes()
@@ -156,7 +155,7 @@ class LeanExecutor(SingleThreadedExecutor):
                     self._do_stock(entity, take)
         self._schedule_services(bool(messages), waits is everything)
         if self._tasks:
-            self._do_tasks()
+            super().spin_once(0.0)
 
     def _take_living(self, waitable: Any) -> Any:
         try:
@@ -182,7 +181,6 @@ class LeanExecutor(SingleThreadedExecutor):
             self._do_stock(guard, self._take_guard_condition)
 
     def _gather(self) -> tuple[_WaitSet, _WaitSet]:
-        self._plain = {}
         key = self.entities()
         subscriptions, timers, _, _, guards, _ = key
         stream = (subscriptions, timers, (), (), guards, ())
@@ -194,16 +192,12 @@ class LeanExecutor(SingleThreadedExecutor):
             waits.release()
         self._waits = None
 
-    def _is_plain(self, entity: Any) -> bool:
-        plain = self._plain.get(entity)
-        if plain is None:
-            plain = self._plain[entity] = not inspect.iscoroutinefunction(entity.callback)
-        return plain
+    def _call(self, callback: Any, *given: Any) -> None:
+        result = callback(*given)
+        if inspect.iscoroutine(result):
+            self.create_task(result)
 
     def _do_timer(self, timer: Any) -> None:
-        if not self._is_plain(timer):
-            self._do_stock(timer, self._take_timer)
-            return
         try:
             with timer.handle:
                 if not timer.handle.is_timer_ready():
@@ -211,12 +205,9 @@ class LeanExecutor(SingleThreadedExecutor):
                 timer.handle.call_timer()
         except InvalidHandle:
             return
-        timer.callback()
+        self._call(timer.callback)
 
     def _do_subscription(self, subscription: Any) -> None:
-        if not self._is_plain(subscription):
-            self._do_stock(subscription, self._take_subscription)
-            return
         try:
             with subscription.handle:
                 taken = subscription.handle.take_message(subscription.msg_type, subscription.raw)
@@ -225,9 +216,9 @@ class LeanExecutor(SingleThreadedExecutor):
         if taken is None:
             return
         if subscription._callback_type is Subscription.CallbackType.MessageOnly:
-            subscription.callback(taken[0])
+            self._call(subscription.callback, taken[0])
         else:
-            subscription.callback(*taken)
+            self._call(subscription.callback, *taken)
 
     def _do_stock(self, entity: Any, take: Any) -> None:
         if not entity.callback_group.can_execute(entity):
@@ -237,15 +228,6 @@ class LeanExecutor(SingleThreadedExecutor):
         if handler.done():
             self._tasks = [t for t in self._tasks if t[0] is not handler]
             handler.result()
-
-    def _do_tasks(self) -> None:
-        for task, *_ in list(self._tasks):
-            if not task.executing() and not task.done():
-                task()
-            if task.done() and not task.cancelled():
-                task.result()
-        with self._tasks_lock:
-            self._tasks = [t for t in self._tasks if not (t[0].done() or t[0].cancelled())]
 
     def shutdown(self, timeout_sec: float | None = None) -> bool:
         """Shut down and release all entities."""
