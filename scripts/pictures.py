@@ -27,7 +27,7 @@ sys.path.insert(0, str(ROOT / "test"))
 
 from browser import CHROMIUM, Browser, Clicks  # noqa: E402
 
-from smp_motor_control.nodes import loopback  # noqa: E402
+from smp_motor_ident.cli.processes import loopback_environment  # noqa: E402
 
 DOMAIN = "87"
 """Default ROS domain of the simulated robot."""
@@ -68,7 +68,7 @@ def prepare(folder: Path) -> None:
         print("pictures:", *command, flush=True)
         subprocess.run(command, cwd=folder, check=True, stdout=subprocess.DEVNULL)
 
-    os.environ.update({"ROS_DOMAIN_ID": DOMAIN, **loopback.loopback_environment(), **os.environ})
+    os.environ.update({"ROS_DOMAIN_ID": DOMAIN, **loopback_environment(), **os.environ})
     folder.mkdir(parents=True, exist_ok=True)
     if not (folder / "demo").exists():
         run("demo", "--output", "demo")

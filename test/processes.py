@@ -15,7 +15,7 @@ from typing import IO
 
 import pytest
 
-from smp_motor_control.nodes import loopback
+from smp_motor_ident.cli.processes import loopback_environment
 
 BUSY = 60.0
 """Additional waiting time on a busy machine before a test gives up [s]."""
@@ -48,7 +48,7 @@ def own_domain() -> Iterator[int]:
     domain, handle = claim_domain()
     with handle, pytest.MonkeyPatch.context() as patch:
         patch.setenv("ROS_DOMAIN_ID", str(domain))
-        for name, value in loopback.loopback_environment().items():
+        for name, value in loopback_environment().items():
             patch.setenv(name, value)
         patch.delenv("ROS_STATIC_PEERS", raising=False)
         yield domain

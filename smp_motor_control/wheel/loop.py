@@ -119,10 +119,8 @@ class WheelLoop:
     ) -> None:
         """Set the hardware between motor and wheel."""
         self._gearbox, self._encoder, self._max_load = gearbox, encoder, max_load
-        self._width, self.wraps_at = (
-            CounterWidth(),
-            0,
-        )  # detected width that differs from encoder.bits
+        self._width = CounterWidth()
+        self.wraps_at = 0  # detected width that differs from encoder.bits
         self.rebuild_speed_source()
 
     def configure(self, settings: LoopSettings) -> None:

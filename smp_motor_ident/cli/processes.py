@@ -16,11 +16,12 @@ from typing import IO, Any
 
 from smp_motor_control.entry import find_domain_problem
 from smp_motor_control.errors import SmpError
-from smp_motor_control.nodes import loopback
+from smp_motor_control.motor.file import find_config
 from smp_motor_ident.cli import interruption, workers
 from smp_motor_ident.errors import ParameterError
 
 FREE_DOMAINS = range(215, 233)  # ROS domains for simulated robots
+FAST_DDS = "rmw_fastrtps"  # jazzy's default middleware, for which the loopback profile is written
 
 
 class ProcessError(SmpError):
@@ -51,8 +52,21 @@ def connect(name: str, ros_arguments: Sequence[str] = ()) -> Iterator[Any]:
 def isolate(domain: int | None) -> int:
     """Restrict ROS to this computer and a domain, by default a free one; return the domain."""
     chosen = _find_free_domain() if domain is None else domain
-    os.environ.update({"ROS_DOMAIN_ID": str(chosen), **loopback.loopback_environment()})
+    os.environ.update({"ROS_DOMAIN_ID": str(chosen), **loopback_environment()})
     return chosen
+
+
+def loopback_environment() -> dict[str, str]:
+    """Return variables that restrict discovery and sockets to this computer.
+
+    ROS's range LOCALHOST restricts discovery only; Fast DDS needs the profile to bind to loopback.
+    """
+    if not os.environ.get("RMW_IMPLEMENTATION", FAST_DDS).startswith(FAST_DDS):
+        return {"ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
+    return {
+        "ROS_AUTOMATIC_DISCOVERY_RANGE": "SYSTEM_DEFAULT",
+        "FASTRTPS_DEFAULT_PROFILES_FILE": str(find_config("loopback.xml")),
+    }
 
 
 def _find_free_domain() -> int:

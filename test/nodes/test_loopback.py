@@ -6,7 +6,7 @@ import socket
 import struct
 from pathlib import Path
 
-from smp_motor_control.nodes import loopback
+from smp_motor_ident.cli.processes import loopback_environment
 
 
 def bound_addresses(pid: int) -> set[str]:
@@ -36,4 +36,4 @@ def test_nodes_bind_to_loopback_and_discover_each_other(process, node, eventuall
 
 def test_other_middleware_gets_only_the_ros_discovery_range(monkeypatch):
     monkeypatch.setenv("RMW_IMPLEMENTATION", "rmw_cyclonedds_cpp")
-    assert loopback.loopback_environment() == {"ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
+    assert loopback_environment() == {"ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}

@@ -14,7 +14,7 @@ from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import Twist, TwistStamped
 from sensor_msgs.msg import Imu, JointState
 
-from smp_motor_control.nodes.odometry_output import frame_prefix
+from smp_motor_control.nodes.skid_steer import frame_prefix
 
 BEHAVIOUR = json.loads(
     (Path(__file__).parent.parent / "data" / "conformance" / "diff_drive_cases.json").read_text()

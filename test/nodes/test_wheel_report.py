@@ -6,7 +6,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from smp_motor_control.nodes import runtime, wheel_report
+from smp_motor_control.nodes import runtime, wheel_pid
 from smp_motor_control.pid import PidGains
 from smp_motor_control.wheel.controller import WheelController, WheelSettings
 from smp_motor_control.wheel.loop import LoopSettings
@@ -24,7 +24,7 @@ def make_report(monkeypatch):
         monkeypatch.setattr(runtime, "Diagnostics", diagnostics)
         node = SimpleNamespace(get_logger=lambda: SimpleNamespace(warning=log.append))
         wheel = WheelController(WheelSettings(loop=LoopSettings(gains=gains)))
-        wheel_report.WheelReport(node, wheel, "left_wheel_joint")
+        wheel_pid.WheelReport(node, wheel, "left_wheel_joint")
         put(wheel)
         level, message, _ = assessments[0]()
         return log, level, message
@@ -34,8 +34,8 @@ def make_report(monkeypatch):
 
 def test_default_gains_are_reported_in_log_and_diagnostics(make_report):
     log, level, message = make_report(PidGains())
-    assert log == [wheel_report.UNTUNED_TEXT]
-    assert wheel_report.UNTUNED_TEXT in message
+    assert log == [wheel_pid.UNTUNED_TEXT]
+    assert wheel_pid.UNTUNED_TEXT in message
     assert level == runtime.OK  # no warning while the wheel is at rest
 
 
