@@ -7,7 +7,7 @@ that no signal is periodic in the sampling: periodic quantisation errors would b
 
 import math
 from abc import ABC, abstractmethod
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import lru_cache
 from typing import overload
 
@@ -24,14 +24,20 @@ _GOLDEN_RATIO = (math.sqrt(5.0) - 1.0) / 2.0
 
 @dataclass(frozen=True, kw_only=True)
 class Excitation(ABC):
-    """Signal that is bounded by ``amplitude`` and zero before time zero."""
+    """Signal that is bounded by ``amplitude`` and zero before time zero and after its duration."""
 
     amplitude: float  # largest absolute value [V], positive
+    duration: float = math.inf  # [s]
+    fade: float = 0.0  # time of fading in, and of fading out [s]
 
     def __post_init__(self) -> None:
         for name, value in vars(self).items():
-            if name not in ("seed", "duration"):
+            if name not in ("seed", "fade") and (name, value) != ("duration", math.inf):
                 check_positive(name, value)
+        if not 0.0 <= self.fade <= self.duration / 2:
+            raise ParameterError(
+                f"fade is {self.fade!r} s; it must be between 0 and half of the duration"
+            )
 
     @overload
     def __call__(self, time: float) -> float: ...
@@ -40,10 +46,13 @@ class Excitation(ABC):
     def __call__(self, time: float | Array) -> float | Array:
         """Return the signal [V] at one or many instants [s]."""
         times = np.atleast_1d(np.asarray(time, dtype=np.float64))
-        begun = times >= 0
-        shape = self._shape(np.where(begun, times, 0.0))
+        inside = (times >= 0) & (times < self.duration)
+        shape = self._shape(np.where(inside, times, 0.0))
         values = np.clip(self.amplitude * shape, -self.amplitude, self.amplitude)
-        values[~begun] = 0.0
+        if self.fade > 0:
+            edge = np.minimum(times, self.duration - times) / self.fade
+            values *= np.clip(edge, 0.0, 1.0)
+        values[~inside] = 0.0
         return float(values[0]) if np.ndim(time) == 0 else values
 
     @abstractmethod
@@ -169,32 +178,6 @@ class Ramp(Excitation):
         phase = (time / (self.period * DETUNING) + 0.75) % 1.0  # begins at zero, rising
         triangle: Array = 4.0 * np.abs(phase - 0.5) - 1.0
         return triangle
-
-
-@dataclass(frozen=True, kw_only=True)
-class Bounded(Excitation):
-    """Another signal of limited duration, faded in and out."""
-
-    amplitude: float = field(default=math.inf, init=False)
-    signal: Excitation
-    duration: float  # [s]
-    fade: float = 0.0  # time of fading in, and of fading out [s]
-
-    def __post_init__(self) -> None:
-        check_positive("duration", self.duration, "s")
-        if not 0.0 <= self.fade <= self.duration / 2:
-            raise ParameterError(
-                f"fade is {self.fade!r} s; it must be between 0 and half of the duration"
-            )
-        object.__setattr__(self, "amplitude", self.signal.amplitude)
-
-    def _shape(self, time: Array) -> Array:
-        inside = (time >= 0) & (time < self.duration)
-        shape = np.where(inside, self.signal(time) / self.amplitude, 0.0)
-        if self.fade > 0:
-            edge = np.minimum(time, self.duration - time) / self.fade
-            shape = shape * np.clip(edge, 0.0, 1.0)
-        return shape
 
 
 SIGNALS: dict[str, type[Excitation]] = {

@@ -18,7 +18,7 @@ from rclpy.node import Node
 from smp_interfaces.msg import MotorState
 from smp_motor_control import WHEELS, check_wheel_names
 from smp_motor_control.errors import ParameterError, SmpError
-from smp_motor_control.excitation import SIGNALS, Bounded, Excitation
+from smp_motor_control.excitation import SIGNALS, Excitation
 from smp_motor_control.fields import fixed
 from smp_motor_control.nodes import runtime
 from smp_motor_control.nodes.motor_writer import MotorWriter
@@ -75,14 +75,14 @@ class Settings:
         return self.wheel_names if "all" in self.wheels else self.wheels
 
     def make_signal(self, wheel: int) -> Excitation:
-        """Return the bounded signal of the n-th wheel."""
+        """Return the signal of the n-th wheel."""
         kind = SIGNALS[self.signal]
         given = {f.name: getattr(self, f.name) for f in fields(kind) if hasattr(self, f.name)}
         if not given.get("hold", 1.0):
             del given["hold"]
         if "seed" in given and self.independent:
             given["seed"] += wheel
-        return Bounded(signal=kind(**given), duration=self.duration, fade=self.fade)
+        return kind(**given)
 
 
 class Excite(Node):

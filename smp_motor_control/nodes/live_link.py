@@ -115,7 +115,7 @@ class LiveLink:
         self.armed = self.controlled = False  # whether commands pass; controllers are active
         self.watched_at = -math.inf  # time of the last check of the page that drives
         self._halt, self.halts = "", 0  # reason of a halt that is due; number of halts
-        self._plans: tuple[float, Mapping[str, Plan], float] | None = None
+        self._plans: tuple[float, Mapping[str, Plan]] | None = None
         self._body = (0.0, 0.0, -math.inf)  # m/s, rad/s, when commanded
         node = client.node
         self._streams = [
@@ -159,10 +159,10 @@ class LiveLink:
         if self.armed and math.isfinite(linear + angular):
             self._body = linear, angular, time.monotonic()
 
-    def follow(self, plans: Mapping[str, Plan], duration: float = math.inf) -> None:
-        """Send set-points by plans, and zero to the other wheels, for a time [s]."""
+    def follow(self, plans: Mapping[str, Plan]) -> None:
+        """Send set-points by plans, and zero to the other wheels, until :meth:`end_plans`."""
         if self.armed:
-            self._plans = time.monotonic(), plans, duration
+            self._plans = time.monotonic(), plans
 
     def end_plans(self) -> None:
         """End what :meth:`follow` began with a set-point of zero."""
@@ -185,15 +185,11 @@ class LiveLink:
             fresh = self.armed and now - at < COMMAND_TIMEOUT_S
             self._send_twist(*((linear, angular) if fresh else (0.0, 0.0)))
         if self._plans is not None:
-            begun, plans, duration = self._plans
-            since = now - begun
-            if since > duration:
-                self.end_plans()
-            else:
-                self._send_setpoints({
-                    wheel: next((v for t, v in reversed(plan) if since >= t), 0.0)
-                    for wheel, plan in plans.items()
-                })  # fmt: skip
+            begun, plans = self._plans
+            self._send_setpoints({
+                wheel: next((v for t, v in reversed(plan) if now - begun >= t), 0.0)
+                for wheel, plan in plans.items()
+            })  # fmt: skip
         try:
             self._read()
             self._listener.on_tick()

@@ -9,7 +9,6 @@ import pytest
 from smp_motor_control.errors import ParameterError
 from smp_motor_control.excitation import (
     SIGNALS,
-    Bounded,
     Fourier,
     Ramp,
     Sine,
@@ -68,8 +67,8 @@ def test_signals_of_different_seeds_are_uncorrelated():
     assert abs(np.corrcoef(one, two)[0, 1]) < 0.1
 
 
-def test_bounded_signal_fades_in_and_ends_at_its_duration():
-    signal = Bounded(signal=Ramp(amplitude=5.0, period=1.0), duration=10.0, fade=1.0)
+def test_signal_fades_in_and_ends_at_its_duration():
+    signal = Ramp(amplitude=5.0, period=1.0, duration=10.0, fade=1.0)
     time = np.linspace(0.0, 12.0, 12_001)
     v = signal(time)
     assert np.all(v[time >= 10.0] == 0.0) and np.max(np.abs(v)) <= 5.0
@@ -84,8 +83,8 @@ def test_bounded_signal_fades_in_and_ends_at_its_duration():
         lambda: Sine(amplitude=1.0, frequency=0.0),
         lambda: Fourier(amplitude=1.0, lowest=5.0, highest=1.0),
         lambda: Fourier(amplitude=1.0, tones=1),
-        lambda: Bounded(signal=Sine(amplitude=1.0), duration=0.0),
-        lambda: Bounded(signal=Sine(amplitude=1.0), duration=1.0, fade=0.6),
+        lambda: Sine(amplitude=1.0, duration=0.0),
+        lambda: Sine(amplitude=1.0, duration=1.0, fade=0.6),
     ],
 )
 def test_invalid_signal_parameters_are_refused(make):
