@@ -14,7 +14,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from smp_motor_control import WHEELS
+from smp_motor_control import WHEELS, get_controller_name
 from smp_motor_control.motor.file import load_motors
 from smp_motor_control.wheel.protection import Bounds
 from smp_motor_ident.bag.read import read_experiments
@@ -292,13 +292,15 @@ def _verify(session: Session, designed: driving.DesignSet) -> str:
     )
     session.begin(plan.DRIVING)
     own = robot.uncontrolled()
+    gains = {get_controller_name(wheel): new for wheel, new in designed.gains.items()}
     try:
         robot.start_controllers(own)
-        with driving.on_trial(robot.client, designed.gains) as trial:
+        with driving.on_trial(robot.client, gains):
             changes, findings = driving.drive_undisturbed(robot, designed, _say)
-            log.store_changes(changes)
-            refused = log.add("verification", findings)
-            trial.kept = session.arguments.apply and not refused
+        log.store_changes(changes)
+        refused = log.add("verification", findings)
+        if kept := session.arguments.apply and not refused:
+            robot.client.set_parameters(gains)
     finally:
         robot.processes.stop(*(f"{wheel}.wheel_pid" for wheel in own))
     if refused:
@@ -311,7 +313,7 @@ def _verify(session: Session, designed: driving.DesignSet) -> str:
     now = "the controllers have their former gains again"
     if own:
         now = f"the wheel_pid that was started for {', '.join(own)} has ended"
-    return f"{did}; {'the gains are set in the running controllers' if trial.kept else now}."
+    return f"{did}; {'the gains are set in the running controllers' if kept else now}."
 
 
 def report_unreliable_motors(estimates: Mapping[str, Estimate]) -> list[Finding]:

@@ -18,7 +18,7 @@ from smp_motor_ident.tune.verification import Change
 
 SCHEMA = 1
 NAME, REPORT = "commissioning.json", "report.html"
-PARTS = ("checked", "identified", "tuning_page", "judged", "tuned")
+PARTS = ("checked", "identified", "judged", "tuned")
 """Parts of a commissioning that ``--resume`` skips once they are done."""
 
 SUMMARY = ("DC gain", "Time constant", "Static voltage", "p", "i", "d", "Settles, driven")

@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 
-from smp_motor_control import get_controller_name
 from smp_motor_control.arrays import Array
 from smp_motor_control.encoder import unwrap
 from smp_motor_ident.bag.decode import read_columns
@@ -137,26 +136,17 @@ class NoMessageError(ProcessError):
     """A controller published no message at a set-point of the drive."""
 
 
-@dataclass
-class Trial:
-    """Gains on trial; ``kept``: whether they stay afterwards."""
-
-    kept: bool = False
-
-
 @contextlib.contextmanager
-def on_trial(client: Any, gains: Mapping[str, Mapping[str, Any]]) -> Iterator[Trial]:
-    """Set gains in the running controllers; restore the old ones unless they are kept."""
-    new = {get_controller_name(wheel): dict(values) for wheel, values in gains.items()}
+def on_trial(client: Any, new: Mapping[str, Mapping[str, Any]]) -> Iterator[None]:
+    """Set parameters of controllers, by node, inside the block; restore the old ones after it."""
     old = client.get_parameters({node: list(values) for node, values in new.items()})
-    pending_restore, trial = dict(client.pending_restore), Trial()
+    pending_restore = dict(client.pending_restore)
     client.set_pending_restore(**pending_restore, gains=old)
     client.set_parameters(new)
     try:
-        yield trial
+        yield
     finally:
-        if not trial.kept:
-            client.set_parameters(old)
+        client.set_parameters(old)
         client.set_pending_restore(**pending_restore)
 
 
