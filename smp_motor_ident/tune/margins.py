@@ -11,6 +11,7 @@ References
 
 import math
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -53,9 +54,8 @@ def make_grid(plant: Plant, count: int = 500) -> Array:
     return frequencies(plant.sample_time, float(np.min(motors.a0 / motors.a1)), count)
 
 
-@dataclass(frozen=True, eq=False)
-class BatchMargins:
-    """Margins of a batch of loops: arrays of shape (n,), units as in Margins.
+class BatchMargins(NamedTuple):
+    """Margins of a batch of loops: arrays of shape (n,), order and units as in Margins.
 
     The phase margin is the smallest rotation, of either sign, that brings the loop to -1.
     """
@@ -75,14 +75,9 @@ def loop_margins(plant: Plant, feedback: Feedback) -> Margins:
         m = batch_margins(loop, omega)
         omega = _refine(omega, loop[0])
     radius = float(spectral_radius(plant, feedback)[0])
-    return Margins(
-        phase=math.copysign(float(m.phase[0]), 1 - radius),
-        gain=float(m.gain[0]),
-        delay=float(m.delay[0]),
-        sensitivity=float(m.sensitivity[0]),
-        crossover=float(m.crossover[0]),
-        spectral_radius=radius,
-    )
+    phase, gain, delay, sensitivity, crossover = (float(values[0]) for values in m)
+    phase = math.copysign(phase, 1 - radius)
+    return Margins(phase, gain, delay, sensitivity, crossover, radius)
 
 
 def _refine(omega: Array, loop: Complex) -> Array:
