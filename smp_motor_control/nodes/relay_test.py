@@ -11,9 +11,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from smp_interfaces.msg import MotorState
-from smp_motor_control.nodes import runtime
 from smp_motor_control.nodes.motor_writer import MotorWriter
 from smp_motor_control.nodes.robot_client import TIMEOUT_S, RobotClient, RobotError
+from smp_motor_control.nodes.wheel_test import Row, WheelTest
+from smp_motor_control.wheel.protection import Bounds
 
 SETTLING_TIME_S = 1.5  # of the constant voltage; the speed is averaged over the last half second
 MAX_VOLTAGE_ERROR = 0.1
@@ -25,7 +26,7 @@ MAX_SHARE_BETWEEN = 0.5
 
 Oscillation = dict[str, np.ndarray]
 """Recorded deviations from the operating point: ``time`` by the stamps [s]; ``voltage`` commanded
-after each sample and ``applied``, the mean before it [V]; ``speed`` and ``angle`` of the wheel
+and ``applied``, its mean, before each sample [V]; ``speed`` and ``angle`` of the wheel
 [rad/s], [rad].  ``applied`` and ``angle`` are NaN if not reported."""
 
 
@@ -38,88 +39,67 @@ class Relay:
     hysteresis: float  # [rad/s, wheel]
 
 
-class _Test:
-    """Relay test that answers every sample with a voltage."""
-
-    def __init__(self, client: RobotClient, wheel: str, relay: Relay) -> None:
-        self.client, self.wheel, self.relay = client, wheel, relay
-        self.centre: float | None = None
-        self.output = relay.bias
-        # Stamp, commanded and applied voltage, speed, angle
-        self.seen: list[tuple[float, ...]] = []
-        self.writer = MotorWriter(client.node, f"{wheel}/")
-
-    def answer(self, message: MotorState) -> None:
-        speed, relay = message.velocity, self.relay
-        if not math.isfinite(speed):
-            return
-        if self.centre is not None and speed > self.centre + relay.hysteresis:
-            self.output = relay.bias - relay.amplitude
-        elif self.centre is not None and speed < self.centre - relay.hysteresis:
-            self.output = relay.bias + relay.amplitude
-        stamp = runtime.seconds(message.header.stamp)
-        self.seen.append((stamp, self.output, message.voltage, speed, message.position))
-        self.writer.send(self.output)
-
-    def run(self, duration: float) -> Oscillation:
-        seen = self.seen
-        with self.client.listen(MotorState, {f"{self.wheel}/motor_state": self.answer}):
-            if not self.client.until(self._is_applied, TIMEOUT_S):
-                raise self._explain_rejected_command()
-            self.client.spin(SETTLING_TIME_S)
-            first = len(seen)
-            if first < 20:
-                raise RobotError(
-                    f"{self.wheel}: only {first} samples in {SETTLING_TIME_S} s, and 20 are needed"
-                    "; raise the rate of motor_state"
-                )
-            late = [row[3] for row in seen if row[0] > seen[-1][0] - 0.5]
-            self.centre = sum(late) / len(late)
-            self.output = self.relay.bias + self.relay.amplitude
-            self.client.spin(duration)
-        return self._subtract_operating_point(first)
-
-    def _is_applied(self) -> bool:
-        """Return whether the hardware applies the constant voltage, if it reports this."""
-        if not self.seen or not self.writer.publisher.get_subscription_count():
-            return False
-        off = abs(self.seen[-1][2] - self.output)
-        return not off > MAX_VOLTAGE_ERROR * self.relay.amplitude  # NaN: not reported
-
-    def _explain_rejected_command(self) -> RobotError:
-        topic = self.writer.publisher.topic_name
-        if not self.writer.publisher.get_subscription_count():
-            return RobotError(f"{topic}: no subscriber; start motor_plant or the robot's driver")
-        return RobotError(
-            f"{topic}: the applied voltage differs from the command; "
-            f"{self.writer.owner or 'another node'} commands the wheel, end it first"
-        )
-
-    def _subtract_operating_point(self, first: int) -> Oscillation:
-        rows = np.array(self.seen[first:]).reshape(-1, 5)
-        time, angle = (rows[:, k] - rows[:1, k] for k in (0, 4))
-        bias, amplitude, centre = self.relay.bias, self.relay.amplitude, self.centre or 0.0
-        applied = rows[:, 2] - bias
-        # The applied voltage is at one of the relay's levels except where it switches.
-        between = np.abs(np.abs(applied) - amplitude) > MAX_VOLTAGE_ERROR * amplitude
-        if np.count_nonzero(between) > MAX_SHARE_BETWEEN * len(applied):
-            raise self._explain_rejected_command()
-        return {
-            "time": time,
-            "voltage": rows[:, 1] - bias,
-            "applied": applied,
-            "speed": rows[:, 3] - centre,
-            "angle": angle - centre * time,
-        }
-
-
 def run_relay_test(client: RobotClient, wheel: str, relay: Relay, duration: float) -> Oscillation:
     """Run the test on a wheel with its controller paused."""
     client.wait_for_wheels([wheel], TIMEOUT_S)
-    with client.paused([wheel]):
-        test = _Test(client, wheel, relay)
-        try:
-            return test.run(duration)
-        finally:
-            test.writer.stop()
-            test.writer.destroy()
+    test = WheelTest(client, {wheel: lambda message: message.position}, Bounds())
+    rows = test.recordings[wheel].rows
+
+    def hold(time: float, message: MotorState) -> float:
+        return relay.bias if math.isfinite(message.velocity) else 0.0
+
+    def switch(time: float, message: MotorState) -> float:
+        off, output = message.velocity - centre, test.commands[wheel]
+        if not math.isfinite(off):
+            return 0.0
+        if abs(off) > relay.hysteresis:
+            return relay.bias - math.copysign(relay.amplitude, off)
+        return relay.bias + relay.amplitude if output == relay.bias else output
+
+    def is_applied() -> bool:
+        """Return whether the hardware applies the constant voltage, if it reports this."""
+        if not rows or not test.writers[wheel].publisher.get_subscription_count():
+            return False
+        off = abs(rows[-1].voltage - relay.bias)
+        return not off > MAX_VOLTAGE_ERROR * relay.amplitude  # NaN: not reported
+
+    with client.paused([wheel]), test.open():
+        test.run({wheel: hold}, TIMEOUT_S, is_applied)
+        if not is_applied():
+            raise _explain_rejected_command(test.writers[wheel])
+        test.run({wheel: hold}, SETTLING_TIME_S)
+        first = len(rows)
+        if first < 20:
+            raise RobotError(
+                f"{wheel}: only {first} samples in {SETTLING_TIME_S} s, and 20 are needed; raise "
+                "the rate of motor_state"
+            )
+        late = [row.velocity for row in rows if row.stamp > rows[-1].stamp - 0.5]
+        centre = float(np.nanmean(late))
+        test.run({wheel: switch}, duration)
+        known = [row for row in rows[first:] if math.isfinite(row.velocity)]
+        # A row of arrays, one for each column
+        columns = Row(*np.array(known).reshape(-1, len(Row._fields)).T)
+        applied = columns.voltage - relay.bias
+        # The applied voltage is at one of the relay's levels except where it switches.
+        between = np.abs(np.abs(applied) - relay.amplitude) > MAX_VOLTAGE_ERROR * relay.amplitude
+        if np.count_nonzero(between) > MAX_SHARE_BETWEEN * len(known):
+            raise _explain_rejected_command(test.writers[wheel])
+    time = columns.stamp - columns.stamp[:1]
+    return {
+        "time": time,
+        "voltage": columns.command - relay.bias,
+        "applied": applied,
+        "speed": columns.velocity - centre,
+        "angle": columns.position - columns.position[:1] - centre * time,
+    }
+
+
+def _explain_rejected_command(writer: MotorWriter) -> RobotError:
+    topic = writer.publisher.topic_name
+    if not writer.publisher.get_subscription_count():
+        return RobotError(f"{topic}: no subscriber; start motor_plant or the robot's driver")
+    return RobotError(
+        f"{topic}: the applied voltage differs from the command; "
+        f"{writer.owner or 'another node'} commands the wheel, end it first"
+    )

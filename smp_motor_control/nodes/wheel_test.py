@@ -24,8 +24,8 @@ from smp_motor_control.nodes.robot_client import RobotClient, RobotError
 from smp_motor_control.nodes.runtime import LATCHED, seconds
 from smp_motor_control.wheel.protection import Bounds, Protection
 
-Law = Callable[[float], float]
-"""Voltage [V] by the time since the start of a phase [s]."""
+Law = Callable[[float, MotorState], float]
+"""Voltage [V] by the time since the start of a phase [s] and the sample that it answers."""
 
 Counter = Callable[[MotorState], float]
 
@@ -71,7 +71,7 @@ class WheelRecording:
 
 
 class WheelTest:
-    """Test of wheels that the client has paused."""
+    """Test of wheels that the client has paused; ``commands`` are the last voltages [V]."""
 
     def __init__(
         self, client: RobotClient, counters: Mapping[str, Counter], bounds: Bounds
@@ -79,43 +79,42 @@ class WheelTest:
         self._client, self._counters = client, counters
         self._watched = {wheel: Protection(bounds) for wheel in counters}
         self.recordings = {wheel: WheelRecording() for wheel in counters}
-        self._commands = dict.fromkeys(counters, 0.0)
+        self.commands = dict.fromkeys(counters, 0.0)
         self._laws: Mapping[str, Law] = {}
         self._phase = 0
         self._begun = 0.0
-        self._writers: dict[str, MotorWriter] = {}
+        self.writers: dict[str, MotorWriter] = {}
 
     @contextlib.contextmanager
     def open(self) -> Iterator["WheelTest"]:
         """Subscribe and allow commands inside the block."""
-        self._writers = {w: MotorWriter(self._client.node, f"{w}/") for w in self.recordings}
+        self.writers = {w: MotorWriter(self._client.node, f"{w}/") for w in self.recordings}
         try:
             listen = self._client.listen_to_wheels
             with listen(MotorState, "motor_state", self.recordings, self._answer):
                 yield self
         finally:
-            for writer in self._writers.values():
+            for writer in self.writers.values():
                 writer.stop()
                 writer.destroy()
 
     def run(
         self, laws: Mapping[str, Law], duration: float, until: Callable[[], bool] | None = None
-    ) -> tuple[int, float]:
-        """Drive wheels for a time or until a condition; return phase number and time taken."""
+    ) -> int:
+        """Drive wheels for a time or until a condition; return the number of this phase."""
         self._phase += 1
         self._begun, self._laws = time.monotonic(), laws
         self._client.until(until or (lambda: False), duration)
-        taken = time.monotonic() - self._begun
         for wheel in laws:
-            if rival := self._writers[wheel].owner:
+            if rival := self.writers[wheel].owner:
                 raise RobotError(f"{wheel}: {rival} owns this wheel; end it first")
-        return self._phase, taken
+        return self._phase
 
     def _answer(self, wheel: str, message: MotorState) -> None:
         stamp = seconds(message.header.stamp)
         age = self._client.node.get_clock().now().nanoseconds * 1e-9 - stamp
         self.recordings[wheel].rows.append(Row(
-            stamp, age, self._commands[wheel], message.voltage, message.velocity,
+            stamp, age, self.commands[wheel], message.voltage, message.velocity,
             message.position, self._counters[wheel](message), float(self._phase),
         ))  # fmt: skip
         why = self._watched[wheel].add(stamp, message.current, message.velocity)
@@ -123,10 +122,10 @@ class WheelTest:
             raise RobotError(f"{wheel}: {why}")
         law = self._laws.get(wheel)
         if law is not None:
-            self._commands[wheel] = law(time.monotonic() - self._begun)
-            self._writers[wheel].send(self._commands[wheel], message.header.stamp)
+            self.commands[wheel] = law(time.monotonic() - self._begun, message)
+            self.writers[wheel].send(self.commands[wheel], message.header.stamp)
         else:
-            self._commands[wheel] = 0.0
+            self.commands[wheel] = 0.0
 
 
 def make_counter(hardware: Any) -> Counter:

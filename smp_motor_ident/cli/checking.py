@@ -52,10 +52,10 @@ class _WheelUnderTest:
     limit: float
     phases: list[Phase] = field(default_factory=list)
 
-    def phase(self, kind: Any, law: Callable[[float], float], duration: float, until: Any) -> float:
+    def phase(self, kind: Any, law: Callable[..., float], duration: float, until: Any) -> float:
         """Drive for a while; return the last voltage."""
-        number, taken = self.test.run({self.wheel: law}, duration, until)
-        level = law(taken)
+        number = self.test.run({self.wheel: law}, duration, until)
+        level = float(self.test.commands[self.wheel])
         self.phases.append(Phase(self.wheel, number, kind, level))
         return level
 
@@ -65,7 +65,7 @@ class _WheelUnderTest:
         rate, first = RAMP_RATE * self.supply, len(tape.rows)
         start = self.phase(
             "ramp",
-            lambda t: sign * min(rate * t, self.limit),
+            lambda t, _: sign * min(rate * t, self.limit),
             self.limit / rate,
             lambda: tape.turned(first) >= TURNING_COUNTS,
         )
@@ -78,14 +78,14 @@ class _WheelUnderTest:
             if level >= self.limit or responds_clearly(level, abs(start), tape.turned(before)):
                 break
             level = min(LEVEL_RATIO * level, self.limit)
-        self.phase("coast", lambda t: 0.0, COAST_S, None)
+        self.phase("coast", lambda *_: 0.0, COAST_S, None)
 
     def _hold(self, voltage: float) -> None:
         """Hold a voltage until the wheel has settled."""
         rows = self.test.recordings[self.wheel].rows
         since = len(rows)
         self.phase(
-            "hold", lambda t: voltage, MAX_HOLD_S, lambda: has_settled(Trace.of(rows[since:]))
+            "hold", lambda *_: voltage, MAX_HOLD_S, lambda: has_settled(Trace.of(rows[since:]))
         )
 
 
@@ -111,7 +111,7 @@ def check_wheels(
         for wheel in wheels:
             say(wheel)
             way = _WheelUnderTest(test, wheel, hardware[wheel].supply_voltage or 12.0, limit)
-            way.phase("rest", lambda t: 0.0, REST_S, None)
+            way.phase("rest", lambda *_: 0.0, REST_S, None)
             way.test_direction(1.0)
             way.test_direction(-1.0)
             phases += way.phases

@@ -91,7 +91,7 @@ def _even(
     lasted = np.diff(time)
     grid = np.arange(time[0], time[-1], step)
     if not np.isfinite(applied).all():  # the hardware does not report it
-        applied = np.concatenate([[0.0], voltage[:-1]])
+        applied = voltage
     # Means over intervals, long and short, are exact as integrals at their ends.
     volt_seconds = np.concatenate([[0.0], np.cumsum(applied[1:] * lasted)])
     if not np.isfinite(angle).all():

@@ -141,7 +141,7 @@ def test_relay_feedback_tolerates_lost_samples():
     kept = np.random.default_rng(4).uniform(size=time.size) > 0.05
     answer = {
         "time": time[kept].tolist(),
-        "voltage": voltage[kept].tolist(),
+        "voltage": np.roll(voltage, 1)[kept].tolist(),  # commanded before the sample
         "applied": acted[kept].tolist(),
         "speed": speed[kept].tolist(),
         "angle": (0.005 * np.cumsum(speed))[kept].tolist(),
@@ -162,7 +162,12 @@ def test_relay_oscillation_is_evaluated_between_gaps_in_the_samples():
     time = 0.005 * np.arange(voltage.size)
     # Five cycles alternate with gaps of 0.4 cycles: no single stretch is long enough.
     kept = time % (5.4 * period) < 5 * period
-    answer = {"time": time, "voltage": voltage, "applied": np.roll(voltage, 2), "speed": speed}
+    answer = {
+        "time": time,
+        "voltage": np.roll(voltage, 1),
+        "applied": np.roll(voltage, 2),
+        "speed": speed,
+    }
     answer = {name: x[kept] for name, x in {**answer, "angle": 0.005 * np.cumsum(speed)}.items()}
     stretches, step = resample_evenly(answer)
     with pytest.raises(DesignError, match="steady cycles"):
