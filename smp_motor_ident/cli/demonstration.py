@@ -74,7 +74,8 @@ def work(arguments: argparse.Namespace) -> int:
     with Processes(folder / "logs") as processes:
         with connect(demo.NAME) as client:
             start(steps.Robot(processes, client, WHEELS, folder), motors, arguments.rate)
-        print(f"running: motor_plant, {len(WHEELS)} wheel_pid, skid_steer (ROS domain {domain})")
+        nodes = f"motor_plant, {len(WHEELS)} wheel_pid, skid_steer"
+        print(f"running: {nodes} (ROS domain {domain})", flush=True)
         accepted = [part for code in ACCEPTED for part in ("--accept", code)]
         steps.run(commission, "--output", str(folder), *EXCITATION, *accepted, "--apply", "--yes")
     designed = driving.read_designs(
