@@ -100,7 +100,11 @@ def _commission(arguments: argparse.Namespace, folder: Path, known: Mapping[str,
         if session is None:
             return 0
         with client.paused(robot.wheels), session.log.store_error():
-            _move(session, known)
+            if not session.log.has("checked"):
+                _check(session, known)
+            for one in _recordings(arguments, session.log):
+                if not _is_recorded(robot, one):
+                    _record(session, one)
             designed = _design(session)
             verdict = _verify(session, designed)
     session.log.store_verdict(True, verdict)
@@ -126,10 +130,8 @@ def _begin(arguments: argparse.Namespace, robot: steps.Robot) -> Session | None:
             _say("wheels, amplitude or duration have changed: all steps are repeated")
         log.begin(robot.wheels, asked)
     left = [one for one in _recordings(arguments, log) if not (same and _is_recorded(robot, one))]
-    if left:
-        log.mark(identified=False, judged=False, tuned=False)
-    parts = {part: log.has(part) for part in ("checked", "identified", "tuned")}
-    schedule = plan.schedule(robot.wheels, left, **parts)
+    computed = {part: not left and log.has(part) for part in ("identified", "tuned")}
+    schedule = plan.schedule(robot.wheels, left, checked=log.has("checked"), **computed)
     session = Session(arguments, robot, log, schedule)
     _report_missing_controllers(arguments, robot)
     _confirm(arguments, robot.wheels, left, schedule)
@@ -163,16 +165,6 @@ def _is_recorded(robot: steps.Robot, one: plan.Recording) -> bool:
     return (robot.folder / one.folder / one.name).is_dir()
 
 
-def _move(session: Session, known: Mapping[str, Any]) -> None:
-    """Check the wheels, then record them under excitation; skip completed steps."""
-    arguments, log = session.arguments, session.log
-    if not log.has("checked"):
-        _check(session, known)
-    for one in _recordings(arguments, log):
-        if not _is_recorded(session.robot, one):
-            _record(session, one)
-
-
 def _check(session: Session, known: Mapping[str, Any]) -> None:
     """Check the wheels one by one; stop at faults that the user must repair."""
     arguments, robot, log = session.arguments, session.robot, session.log
@@ -184,7 +176,6 @@ def _check(session: Session, known: Mapping[str, Any]) -> None:
     log.store_checks(checked.figures, checked.amplitude, checked.speed)
     log.stop_on(log.add("checks", checked.findings))
     log.mark(checked=True)
-    log.write()
 
 
 def _record(session: Session, one: plan.Recording) -> None:
@@ -205,7 +196,6 @@ def _record(session: Session, one: plan.Recording) -> None:
         robot.processes.stop("excite", "record")
     log = session.log
     log.mark(identified=False, judged=False, tuned=False)
-    log.write()
     (robot.folder / one.folder).mkdir(exist_ok=True)
     draft.rename(robot.folder / one.folder / one.name)
     earlier = [r for r in _recordings(arguments, log) if r != one and _is_recorded(robot, r)]
@@ -246,7 +236,6 @@ def _design(session: Session) -> driving.DesignSet:
             "validation", validate_motors(estimates, folder / plan.FITTED, folder / plan.HELD_OUT)
         )
         log.mark(judged=True)
-        log.write()
     log.stop_on(log.find_blocking("identification") or log.find_blocking("validation"))
     if not log.has("tuned"):
         session.begin(plan.TUNING)
@@ -254,7 +243,6 @@ def _design(session: Session) -> driving.DesignSet:
         results = str(folder / "identification")
         steps.run(tune, results, "--output", str(gains), "--force", *accepted)
         log.mark(tuned=True)
-        log.write()
     return driving.read_designs(estimates, gains)
 
 
@@ -279,7 +267,6 @@ def _identify(session: Session, part: str) -> dict[str, Estimate]:
             )
         raise
     log.mark(identified=True, judged=False, tuned=False)
-    log.write()
     return read_identification(results)
 
 

@@ -55,8 +55,9 @@ class CommissioningLog:
         return bool(self.document.get(part))
 
     def mark(self, **done: bool) -> None:
-        """Store which parts are done, so that ``--resume`` skips them."""
+        """Write which parts are done, so that ``--resume`` skips them."""
         self.document |= done
+        self.write()
 
     def store_checks(self, figures: Mapping[str, Figures], amplitude: float, speed: float) -> None:
         """Record the results of the wheel checks, see :class:`~.checking.CheckResult`."""
