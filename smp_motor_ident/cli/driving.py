@@ -71,6 +71,16 @@ def read_drive(bag: Path, wheels: Sequence[str], namespace: str = "") -> dict[st
 
 
 def read_changes(
+    driven: Mapping[str, DriveRecording], plan: Plan, given: DesignSet
+) -> tuple[list[Change], list[Finding]]:
+    """Return the changes of all wheels, and a finding where the computer disturbed the drive."""
+    read = [read_wheel_changes(wheel, one, plan, given) for wheel, one in driven.items()]
+    changes = [change for found, _ in read for change in found]
+    silence = max(waited for _, waited in read)
+    return changes, verification.report_silence(silence) or verification.report_loop_delay(changes)
+
+
+def read_wheel_changes(
     wheel: str, driven: DriveRecording, plan: Plan, given: DesignSet
 ) -> tuple[list[Change], float]:
     """Return a wheel's changes of set-point from rest, and its longest wait for an answer [s]."""
@@ -184,15 +194,12 @@ def drive_undisturbed(
         say(f"driving on the new gains: {', '.join(name for name, *_ in plan)}")
         driven = read_drive(drive(robot, plan), list(designed.document), namespace)
         try:
-            read = [read_changes(wheel, one, plan, designed) for wheel, one in driven.items()]
+            changes, late = read_changes(driven, plan, designed)
         except NoMessageError as error:
             if not left:
                 raise
             say(f"the drive was disturbed: {error}")
             continue
-        changes = [change for found, _ in read for change in found]
-        silence = max(waited for _, waited in read)
-        late = verification.report_silence(silence) or verification.report_loop_delay(changes)
         judged = verification.judge(changes)
         if not (late and (judged or late[0].severity == "refused")):
             break

@@ -50,7 +50,9 @@ def test_measured_settling_of_a_simulated_drive_matches_the_design(tmp_path):
     setpoints = np.array([asked[min(int(t / LASTS), len(asked) - 1)] for t in run.time])
     steps = np.full(run.time.size, STEP)
     answers = table(run.time, setpoint=setpoints, output=none, age=steps, dt=steps)
-    changes, _ = driving.read_changes(WHEEL, driving.DriveRecording(state, answers), PLAN, given)
+    changes, _ = driving.read_wheel_changes(
+        WHEEL, driving.DriveRecording(state, answers), PLAN, given
+    )
     assert [(one.name, one.setpoint) for one in changes] == [("forward", 2.0), ("reverse", -1.0)]
     for one in changes:
         # Tolerance of two samples: another size of change, and speed from counts.
@@ -59,10 +61,10 @@ def test_measured_settling_of_a_simulated_drive_matches_the_design(tmp_path):
         assert one.reading.overshoot < 1.0
     # A lagging wheel is detected: the same drive, 0.1 s late.
     late = driving.DriveRecording(table(run.time + 0.1, **state.columns), answers)
-    (behind, *_), _ = driving.read_changes(WHEEL, late, PLAN, given)
+    (behind, *_), _ = driving.read_wheel_changes(WHEEL, late, PLAN, given)
     assert behind.reading.settling - stated["value"] > 0.05
     # A clock step during the drive gives one error line and allocates no samples for the gap.
     early = np.where(run.time < 0.5, 0.0, 1.7e9) + run.time
     torn = driving.DriveRecording(table(early, **state.columns), table(early, **answers.columns))
     with pytest.raises(ProcessError, match="a clock was set"):
-        driving.read_changes(WHEEL, torn, PLAN, given)
+        driving.read_wheel_changes(WHEEL, torn, PLAN, given)
