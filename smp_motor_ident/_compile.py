@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import pickle
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, TypeVar, cast
@@ -18,6 +19,10 @@ OPTIONS: dict[str, Any] = {
     "nogil": True,
     "fastmath": {"nsz"},
 }
+
+
+UNREADABLE = (ImportError, AttributeError, EOFError, ValueError, pickle.UnpicklingError)
+"""Errors of a cache that names what this version does not have, or that is damaged."""
 
 
 def _stamp() -> tuple[tuple[int, int], ...]:
@@ -54,8 +59,12 @@ def _without_typing(cache: Any) -> Callable[[Any, Any], Any]:
 
     def load(signature: Any, target: Any) -> Any:
         rtsys.initialize(target)
-        with cache._guard_against_spurious_io_errors():
-            return cache._load_overload(signature, target)
+        try:
+            with cache._guard_against_spurious_io_errors():
+                return cache._load_overload(signature, target)
+        except UNREADABLE:  # left by another version, or cut off: it is compiled again
+            cache.flush()
+            return None
 
     return load
 
