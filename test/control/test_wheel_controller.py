@@ -1,9 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The fault matrix of one wheel, event by event, in simulated time."""
+"""The fault matrix of one wheel, event by event, in simulated time, and its documented table."""
 
 import math
+import re
 from dataclasses import replace
 from itertools import pairwise
+from pathlib import Path
 
 import pytest
 from wheel_world import (
@@ -171,3 +173,29 @@ def test_supply_limits_voltage_and_invalid_hardware_is_refused():
             world.wheel.set_hardware(Gearbox(65.5), Encoder(), 12.0, resistance)
     world.run(1.0)
     assert max(abs(voltage) for _, voltage, _ in world.log) <= 5.0
+
+
+ROOT = Path(__file__).resolve().parents[2]
+TABLE = ROOT / "docs" / "decisions" / "when-a-wheel-stops.md"
+
+
+def read_documented_faults() -> list[list[str]]:
+    lines = [line for line in TABLE.read_text().splitlines() if line.startswith("| ")]
+    return [[cell.strip() for cell in line.strip("|").split(" | ")] for line in lines[2:]]
+
+
+def test_every_documented_fault_names_an_existing_test():
+    sources = "\n".join(path.read_text() for path in (ROOT / "test").rglob("test_*.py"))
+    known = set(re.findall(r"^def (test_\w+)\(", sources, re.MULTILINE))
+    matrix = {f"MATRIX: {row[0]}" for row in MATRIX}
+    known |= matrix
+    rows, named = read_documented_faults(), set[str]()
+    assert len(rows) > 20 and len(MATRIX) > 12
+    for row in rows:
+        assert len(row) == 6 and all(row), row
+        tests = re.findall(r"`([^`]+)`", row[5])
+        assert tests, f"{row[0]}: no test"
+        for test in tests:
+            assert test in known or (ROOT / test).is_file(), f"{row[0]}: there is no {test}"
+        named |= set(tests)
+    assert matrix <= named

@@ -8,6 +8,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from bench_scripts import load
 from wheel_simulation import Run, Timing, simulate_closed_loop
 
 from smp_motor_control.fields import build_settings, parameters_in
@@ -29,6 +30,7 @@ from smp_motor_ident.tune.simulation import Controller, Inputs, simulate
 from smp_motor_ident.tune.writing import describe_slow_loop, parameters, silence
 
 MOTORS = Path(__file__).resolve().parents[2] / "config" / "motors_paper.yaml"
+ENTRIES, TOGETHER = load_motors(MOTORS), load("together")
 STEP = 1.2
 """Set-point [rad/s, wheel]: about half of the slowest motor's top speed."""
 
@@ -51,7 +53,7 @@ def settings_of(one) -> LoopSettings:
 def drive_motor(wheel: str, one: Design, setpoint: Callable[[float], float], seconds: float) -> Run:
     """Return the simulated drive of a motor of the paper with its design."""
     return simulate_closed_loop(
-        load_motors(MOTORS)[wheel], settings_of(one), setpoint, seconds,
+        ENTRIES[wheel], settings_of(one), setpoint, seconds,
         timing=Timing(sample_time=one.loop.sample_time, delay=one.loop.expected_delay),
         drive=DriveSettings(command_timeout=np.inf, pwm_steps=1000),
     )  # fmt: skip
@@ -125,7 +127,7 @@ def test_friction_feed_forward_switches_in_time_at_a_reversal(estimates):
 
 @pytest.mark.parametrize("rate", [1.0, 2.0, 4.0, 5.0, 10.0, 20.0])
 def test_slow_loop_reaches_its_set_point_despite_lost_samples(estimates, rate):
-    T, entry = 1 / rate, load_motors(MOTORS)["front_left"]
+    T, entry = 1 / rate, ENTRIES["front_left"]
     one = design(estimates["front_left"], Loop(sample_time=T))
     written = flatten(parameters(one))
     values = {name: field.default for name, field in parameters_in(WheelSettings).items()}
@@ -157,3 +159,19 @@ def test_slow_loop_reaches_its_set_point_despite_lost_samples(estimates, rate):
     assert begun > 55
     assert np.mean(speeds[-20:]) == pytest.approx(target, rel=0.1)
     assert bool(describe_slow_loop(one)) is (silence(one.loop) > 0.2)
+
+
+@pytest.fixture(scope="module")
+def found():
+    return TOGETHER.identify_recorded(ENTRIES, 200.0, seed=11, duration=10.0)
+
+
+@pytest.mark.parametrize(("rate", "most"), [(100.0, 0.010), (200.0, 0.005), (1000.0, 0.005)])
+def test_four_motors_under_uneven_load_settle_together_without_overshoot(found, rate, most):
+    runs = TOGETHER.compare(ENTRIES, found, rate, seed=11)
+    plain, arrival = (TOGETHER.assess(runs[way]) for way in ("plain", "together"))
+    # The issue's bounds: one control period, 5 ms at 1 kHz; overshoot below 1 %.
+    assert arrival.spread <= most
+    assert max(arrival.overshoot.values()) < 1.0
+    # The common reference causes it: under a plain step the same loops are far apart.
+    assert plain.spread > 3.0 * arrival.spread

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A drive on new gains compared with its prediction."""
+"""A drive on new gains: its set-point changes, compared with the design and its prediction."""
 
+import json
 import math
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -10,12 +11,15 @@ import pytest
 from paper_motors import combinations_of
 from wheel_simulation import Timing, simulate_closed_loop
 
-from smp_motor_control.motor.file import load_motors
+from smp_motor_control.motor.file import PAPER_MOTORS, find_config, load_motors
 from smp_motor_control.motor.hardware import DriveSettings
 from smp_motor_control.motor.parameters import MotorParameters
+from smp_motor_ident.bag.storage import Table
+from smp_motor_ident.cli import driving, tune
+from smp_motor_ident.cli.processes import ProcessError
 from smp_motor_ident.cli.tuning import read_estimates
 from smp_motor_ident.result import Quantity
-from smp_motor_ident.tune import Design, Loop, design
+from smp_motor_ident.tune import Design, Loop, design, verification
 from smp_motor_ident.tune import verification as v
 from smp_motor_ident.tune.writing import parameters
 
@@ -205,3 +209,59 @@ def test_speed_resolution_matches_the_scatter_of_the_smoothed_slope():
     _, slope = v.smooth_speed(time, angle, STEP)
     # Errors of a staircase are periodic, not independent: tolerance of a factor of two.
     assert 0.5 < np.std(slope[20:-20]) / v.resolution(quantum, STEP) < 2.0
+
+
+SEGMENT_S = 1.0
+PLAN = [
+    (name, speed, SEGMENT_S)
+    for name, speed in (("stand", 0.0), ("forward", 2.0), ("stop", 0.0), ("reverse", -1.0))
+]
+
+
+def make_table(time: np.ndarray, **columns: np.ndarray) -> Table:
+    return Table(None, np.round(1e9 * time).astype(np.int64), columns)
+
+
+def test_measured_settling_of_a_simulated_drive_matches_the_design(tmp_path):
+    motors = find_config(PAPER_MOTORS)
+    gains = tmp_path / "gains.yaml"
+    assert tune.main([str(motors), "--output", str(gains), "--supply", "12"]) == 0
+    given = driving.read_designs(read_estimates(motors), gains)
+    stated = json.loads((tmp_path / "gains.json").read_text())["wheels"][WHEEL]["settling"]
+    assert stated["common"]  # four wheels, one transition
+
+    entry = load_motors(motors)[WHEEL]
+    asked = [speed for _, speed, _ in PLAN]
+    run = simulate_closed_loop(
+        entry,
+        verification.loop_settings(given.gains[WHEEL]),
+        lambda t: asked[min(int(t / SEGMENT_S), len(asked) - 1)],
+        SEGMENT_S * len(asked),
+        timing=Timing(sample_time=STEP, delay=STEP),
+        drive=DriveSettings(command_timeout=math.inf),
+    )
+    none = np.full(run.time.size, np.nan)
+    state = make_table(run.time, encoder_count=run.count, position=none, voltage=none)
+    setpoints = np.array([asked[min(int(t / SEGMENT_S), len(asked) - 1)] for t in run.time])
+    steps = np.full(run.time.size, STEP)
+    answers = make_table(run.time, setpoint=setpoints, output=none, age=steps, dt=steps)
+    changes, _ = driving.read_wheel_changes(
+        WHEEL, driving.DriveRecording(state, answers), PLAN, given
+    )
+    assert [(one.name, one.setpoint) for one in changes] == [("forward", 2.0), ("reverse", -1.0)]
+    for one in changes:
+        # Tolerance of two samples: another size of change, and speed from counts.
+        assert abs(one.reading.settling - stated["value"]) <= 2 * STEP
+        assert abs(one.reading.settling - one.expected.settling) <= STEP
+        assert one.reading.overshoot < 1.0
+    # A lagging wheel is detected: the same drive, 0.1 s late.
+    late = driving.DriveRecording(make_table(run.time + 0.1, **state.columns), answers)
+    (behind, *_), _ = driving.read_wheel_changes(WHEEL, late, PLAN, given)
+    assert behind.reading.settling - stated["value"] > 0.05
+    # A clock step during the drive gives one error line and allocates no samples for the gap.
+    early = np.where(run.time < 0.5, 0.0, 1.7e9) + run.time
+    torn = driving.DriveRecording(
+        make_table(early, **state.columns), make_table(early, **answers.columns)
+    )
+    with pytest.raises(ProcessError, match="a clock was set"):
+        driving.read_wheel_changes(WHEEL, torn, PLAN, given)

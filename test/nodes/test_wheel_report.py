@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Diagnostics of wheel_pid, without a process."""
+"""Diagnostics of wheel_pid, and evaluation of a wheel test, without a process."""
 
 import math
 from types import SimpleNamespace
@@ -7,6 +7,7 @@ from types import SimpleNamespace
 import pytest
 
 from smp_motor_control.nodes import runtime, wheel_pid
+from smp_motor_control.nodes.wheel_test import Row, WheelRecording
 from smp_motor_control.pid import PidGains
 from smp_motor_control.wheel.controller import WheelController, WheelSettings
 from smp_motor_control.wheel.loop import LoopSettings
@@ -78,3 +79,30 @@ def test_oscillation_is_reported_with_advice(make_report):
     assert level == runtime.WARN
     assert "oscillates by 0.88 rad/s around 1.5 rad/s at 6.3 Hz" in message
     assert "feedback at 50 Hz; halve p, i and d, or design them with tune --rate 50" in message
+
+
+def recording(position) -> WheelRecording:
+    """Return 8 s of a wheel at 2 rad/s whose driver reports ``position(angle)``."""
+    rows = [Row(1e4 + t, 0.0, 3.0, 3.0, 2.0, position(2.0 * t), 0.0, 1.0)
+            for t in (0.01 * k for k in range(800))]  # fmt: skip
+    return WheelRecording(rows)
+
+
+@pytest.mark.parametrize(
+    ("position", "words"),
+    [
+        (lambda angle: angle, ""),
+        (lambda angle: math.nan, ""),
+        (lambda angle: 0.0, "never changes"),
+        (lambda angle: angle % (2 * math.pi), "wraps"),
+        (lambda angle: math.remainder(angle, 2 * math.pi), "wraps"),
+        (lambda angle: angle if angle < 9.0 else angle - 9.0, "jumped"),
+    ],
+)
+def test_position_unusable_for_odometry_is_reported(position, words):
+    said = recording(position).position_problem()
+    assert words in said and bool(words) is bool(said)
+
+
+def test_empty_recording_has_no_position_problem():
+    assert WheelRecording().position_problem() == ""
