@@ -9,12 +9,14 @@ from typing import Any
 
 import mcap.writer
 import numpy as np
+import pytest
 import yaml
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 from scipy.signal import cont2discrete, lfilter
 
 from smp_motor_ident.bag import BagWriter, read_records
+from smp_motor_ident.errors import BagError
 from smp_motor_ident.record import Record
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -122,6 +124,13 @@ def motion(n=200, wheel="front_left", step=10000000, seed=1, bits=0):
     return Motion(wheel, time, voltage, rng.normal(0, 1, n), velocity, position, count, bits)
 
 
+def write_table(path: Path, separator: str = ",", **columns: Iterable[Any]) -> Path:
+    """Write a table of columns below their names."""
+    rows = [columns, *zip(*columns.values())]
+    path.write_text("\n".join(separator.join(map(str, row)) for row in rows))
+    return path
+
+
 def follow(voltage):
     """Return the speed of a motor, 20 rad/s/V and 0.1 s, under voltages held for 10 ms each."""
     speed = np.zeros(len(voltage))
@@ -174,14 +183,25 @@ def notes(record: Record) -> str:
     return " ".join(finding.message for finding in record.findings)
 
 
+def codes(record: Record) -> list[str]:
+    """Return the codes of all findings."""
+    return [finding.code for finding in record.findings]
+
+
 def definition(type_name: str) -> str:
     return TYPES.generate_msgdef(type_name, ros_version=2)[0]
+
+
+def write_file(path: Path, messages: Iterable[Sent], **options: Any) -> Path:
+    """Write the file of a bag in the format of its suffix, and its folder."""
+    return (write_sqlite if path.suffix == ".db3" else write_mcap)(path, messages, **options)
 
 
 def write_mcap(
     path, messages, *, defined=True, encode=bytes, profile="ros2", finish=True, **options
 ):
     """Write an .mcap file with the mcap library."""
+    path.parent.mkdir(exist_ok=True)
     options.setdefault("chunk_size", 4096)
     options.setdefault("compression", mcap.writer.CompressionType.NONE)
     with path.open("wb") as file:
@@ -217,6 +237,7 @@ TOPIC_COLUMNS = {
 
 def write_sqlite(path, messages, *, schema=4, encode=bytes, qos=""):
     """Write a .db3 file as rosbag2 laid it out in that version of its schema."""
+    path.parent.mkdir(exist_ok=True)
     database = sqlite3.connect(path)
     database.execute(
         "CREATE TABLE topics(id INTEGER PRIMARY KEY, name TEXT NOT NULL, type TEXT NOT NULL, "
@@ -266,7 +287,6 @@ def write_metadata(
     messages,
     *,
     version=9,
-    storage="mcap",
     compression=("", ""),
     counts=None,
     qos=None,
@@ -289,7 +309,7 @@ def write_metadata(
     stamps = [sent.stamp for sent in messages] or [0]
     information: dict[str, Any] = {
         "version": version,
-        "storage_identifier": storage,
+        "storage_identifier": "sqlite3" if ".db3" in files[0] else "mcap",
         "relative_file_paths": files if version >= 4 else [f"{folder.name}/{f}" for f in files],
         "duration": {"nanoseconds": max(stamps) - min(stamps)},
         "starting_time": {"nanoseconds_since_epoch": min(stamps)},
@@ -324,5 +344,24 @@ def assert_read(record: Any, truth: Motion, n: int | None = None) -> None:
 def read(path: Path, messages: Iterable[Sent], mapping: Any = None) -> Record:
     """Return the only record of a bag of these messages."""
     path.unlink(missing_ok=True)
-    write_mcap(path, messages)
-    return next(iter(read_records(path, mapping).values()))
+    return read_one(write_mcap(path, messages), mapping)
+
+
+def read_one(path: Path, mapping: Any = None) -> Record:
+    """Return the only record of a file."""
+    (record,) = read_records(path, mapping).values()
+    return record
+
+
+def read_table(folder: Path, mapping: Any, **columns: Iterable[Any]) -> Record:
+    """Return the only record of a table of these columns."""
+    return read_one(write_table(folder / "log.csv", **columns), mapping)
+
+
+def assert_refused(match: str, source: Any, mapping: Any = None) -> None:
+    """Assert that reading is refused in one line that gives the reason and names the file."""
+    with pytest.raises(BagError, match=match) as refused:
+        read_records(source, mapping)
+    message = str(refused.value)
+    assert "\n" not in message
+    assert not isinstance(source, Path) or source.name in message, message

@@ -4,14 +4,14 @@
 import numpy as np
 import pytest
 from independent import simulate
-from recordings import START, floats, in_order, read
+from recordings import START, codes, floats, in_order, read, read_table
 
-from smp_motor_ident.bag import read_records
 from smp_motor_ident.estimate import estimate
 from smp_motor_ident.quality.stamps import find_beat, move_to_beat
 from smp_motor_ident.record import Hardware, Record
 
 T = 10_000_000  # ns
+MAP = ["voltage=u velocity=y time=t"]
 
 
 def arrivals(kind: str, n: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
@@ -65,11 +65,9 @@ def test_regular_times_are_not_corrected():
 def test_log_of_arrival_times_is_moved_to_sampling_times(tmp_path, kind):
     late, true = arrivals(kind, 2000, 6)
     motion = np.sin(2 * np.pi * true * 1e-9)  # 1 Hz, smooth on its true instants
-    rows = [f"{t * 1e-9:.6f},{k % 7},{y:.9f}" for k, (t, y) in enumerate(zip(late, motion))]
-    (tmp_path / "log.csv").write_text("t,u,y\n" + "\n".join(rows))
-    record = read_records(tmp_path / "log.csv", ["voltage=u velocity=y time=t"])["motor"]
+    record = read_table(tmp_path, MAP, t=np.round(1e-9 * late, 6), u=np.arange(2000) % 7, y=motion)
     assert len(record) == 2000
-    assert "arrival_beat" in [finding.code for finding in record.findings]
+    assert "arrival_beat" in codes(record)
     assert np.ptp(record.time - true * 1e-9) < 0.05e-9 * T
 
 
@@ -77,10 +75,8 @@ def test_jittered_stamps_consistent_with_motion_are_kept(tmp_path):
     rng = np.random.default_rng(7)
     time = T * np.arange(2000) + rng.uniform(0, 0.8 * T, 2000)
     motion = np.sin(2 * np.pi * time * 1e-9)  # sampled at the time of the stamp
-    rows = [f"{t * 1e-9:.9f},{k % 7},{y:.9f}" for k, (t, y) in enumerate(zip(time, motion))]
-    (tmp_path / "log.csv").write_text("t,u,y\n" + "\n".join(rows))
-    record = read_records(tmp_path / "log.csv", ["voltage=u velocity=y time=t"])["motor"]
-    assert "arrival_beat" not in [finding.code for finding in record.findings]
+    record = read_table(tmp_path, MAP, t=np.round(1e-9 * time, 9), u=np.arange(2000) % 7, y=motion)
+    assert "arrival_beat" not in codes(record)
 
 
 def _record_with_late_stamps(kind: str, seed: int) -> tuple[Record, float]:
@@ -104,7 +100,7 @@ def _record_with_late_stamps(kind: str, seed: int) -> tuple[Record, float]:
 def test_inductance_is_estimated_from_record_with_arrival_stamps(kind):
     record, electric = _record_with_late_stamps(kind, 8)
     found = estimate(record)
-    assert "arrival_beat" in [finding.code for finding in found.findings]
+    assert "arrival_beat" in codes(found)
     assert not found.unreliable
     ratio = found.parameters["inductance"].value / found.parameters["resistance"].value
     # A tenth: the beat is known to a twentieth of a sample, L/R here is two samples.
@@ -152,7 +148,7 @@ def _record_with_stalls(seed: int, sampled_late: bool) -> Record:
 def test_stalled_samples_keep_their_stamps_and_delayed_stamps_are_corrected(seed):
     honest, arrived = _record_with_stalls(seed, True), _record_with_stalls(seed, False)
     assert move_to_beat(honest) is honest
-    assert "arrival_beat" in [finding.code for finding in move_to_beat(arrived).findings]
+    assert "arrival_beat" in codes(move_to_beat(arrived))
 
 
 def test_standard_error_of_period_matches_scatter_of_estimates():
@@ -176,4 +172,4 @@ def test_bunched_commands_are_moved_to_their_sampling_times(tmp_path, held):
     record = read(tmp_path / "bag.mcap", sent, ["voltage=/pwm.data velocity=/w.data"])
     assert len(record) > n - 5
     np.testing.assert_allclose(np.diff(record.time), 0.01, rtol=1e-3)
-    assert not [f for f in record.findings if f.code == "duplicate_samples"]
+    assert "duplicate_samples" not in codes(record)

@@ -5,9 +5,22 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from recordings import START, TYPES, Sent, floats, follow, in_order, read, serialized
+from recordings import (
+    START,
+    TYPES,
+    Sent,
+    assert_refused,
+    codes,
+    floats,
+    follow,
+    in_order,
+    read,
+    read_one,
+    read_table,
+    serialized,
+    write_table,
+)
 
-from smp_motor_ident.bag import read_records
 from smp_motor_ident.errors import BagError
 from smp_motor_ident.record import Record
 
@@ -16,24 +29,13 @@ T = 0.01 * np.arange(N)
 RNG = np.random.default_rng(8)
 U = np.repeat(RNG.uniform(-6, 6, N // 20), 20)
 SPEED = follow(U)
-
-
-def write(path: Path, **columns: np.ndarray) -> Path:
-    rows = zip(*columns.values())
-    lines = [",".join(columns), *(",".join(repr(float(v)) for v in row) for row in rows)]
-    path.write_text("\n".join(lines))
-    return path
-
-
-def codes(record) -> list[str]:
-    return [finding.code for finding in record.findings]
+MAP = ["voltage=u velocity=y time=t"]
 
 
 def test_velocity_outliers_are_removed(tmp_path):
     speed = SPEED.copy()
     speed[100], speed[200] = 1e200, speed[200] + 500  # corrupted exponent, corrupted mantissa
-    path = write(tmp_path / "log.csv", t=T, u=U, y=speed)
-    record = read_records(path, ["voltage=u velocity=y time=t"])["motor"]
+    record = read_table(tmp_path, MAP, t=T, u=U, y=speed)
     assert np.flatnonzero(np.isnan(record.velocity)).tolist() == [100, 200]
     assert "impossible_jump" in codes(record)
 
@@ -47,27 +49,22 @@ def test_valid_motion_loses_no_sample_as_outlier(tmp_path, shape):
         speed = np.rint(speed / 40) * 40
     elif shape == "rest":
         voltage[:350], speed[:350] = 0.0, 0.0
-    path = write(tmp_path / "log.csv", t=T, u=voltage, y=speed)
-    assert "impossible_jump" not in codes(
-        read_records(path, ["voltage=u velocity=y time=t"])["motor"]
-    )
+    assert "impossible_jump" not in codes(read_table(tmp_path, MAP, t=T, u=voltage, y=speed))
 
 
 COUNT = np.rint(np.cumsum(SPEED) * 0.01 * 500 / (2 * np.pi)).astype(np.int64)
 
 
-def read_count(path: Path, count: np.ndarray, bits: int = 0) -> Record:
-    rows = zip(T.tolist(), U.tolist(), count.tolist())
-    path.write_text("t,u,n\n" + "\n".join(f"{t!r},{u!r},{n}" for t, u, n in rows))
+def read_count(folder: Path, count: np.ndarray, bits: int = 0) -> Record:
     mapping = f"voltage=u count=n time=t counts_per_revolution=500 encoder_bits={bits}"
-    return read_records(path, [mapping])["motor"]
+    return read_table(folder, [mapping], t=T, u=U, n=count)
 
 
 @pytest.mark.parametrize("spoilt", [-(1 << 62), 3 << 40, 3 << 20])
 def test_sample_with_count_outlier_is_removed(tmp_path, spoilt):
     count = COUNT.copy()
     count[150] += spoilt
-    record = read_count(tmp_path / "log.csv", count)
+    record = read_count(tmp_path, count)
     assert "impossible_jump" in codes(record)
     np.testing.assert_array_equal(record.count, np.delete(COUNT, 150))
 
@@ -75,7 +72,7 @@ def test_sample_with_count_outlier_is_removed(tmp_path, spoilt):
 def test_counter_oscillating_across_its_wrap_loses_no_sample(tmp_path):
     to_and_fro = np.rint(30 * np.sin(0.4 * np.arange(N))).astype(np.int64)
     to_and_fro[: N // 2] = 1000  # most steps are zero
-    record = read_count(tmp_path / "log.csv", to_and_fro % (1 << 16), 16)
+    record = read_count(tmp_path, to_and_fro % (1 << 16), 16)
     assert "impossible_jump" not in codes(record)
     assert record.count is not None and record.count.size == N
     np.testing.assert_array_equal(np.diff(record.count), np.diff(to_and_fro))
@@ -86,9 +83,9 @@ def test_count_alternating_between_two_publishers_is_refused(tmp_path, every):
     count = COUNT.copy()
     count[::every] = 70_000  # a forgotten node whose motor is at rest
     with pytest.raises(BagError, match=r"alternates between two counters.*two nodes published it"):
-        read_count(tmp_path / "log.csv", count)
+        read_count(tmp_path, count)
     count[::every] = COUNT[::every] + 900  # within the motion of one sample
-    read_count(tmp_path / "log.csv", count)
+    read_count(tmp_path, count)
 
 
 @pytest.mark.parametrize("kind", ["armature", "offset", "without sign", "supply"])
@@ -101,8 +98,7 @@ def test_unsigned_current_is_dropped_and_velocity_kept(tmp_path, kind):
         "without sign": np.abs(armature),
         "supply": armature * U / 12,
     }[kind]
-    path = write(tmp_path / "log.csv", t=T, u=U, y=speed, i=current)
-    record = read_records(path, ["voltage=u velocity=y current=i time=t"])["motor"]
+    record = read_table(tmp_path, [*MAP, "current=i"], t=T, u=U, y=speed, i=current)
     dropped = kind in ("without sign", "supply")
     assert ("unsigned_current" in codes(record)) is dropped
     assert (record.current is None) is dropped
@@ -112,52 +108,43 @@ def test_unsigned_current_is_dropped_and_velocity_kept(tmp_path, kind):
 @pytest.mark.parametrize("levels", [(0, 1), (-1, 1)])
 def test_voltage_sign_is_taken_from_direction_column(tmp_path, levels):
     direction = np.where(U > 0, levels[1], levels[0])
-    path = write(tmp_path / "log.csv", t=T, pwm=np.abs(U) / 12 * 255, dir=direction, y=SPEED)
-    mapping = "voltage=pwm:pwm direction=dir velocity=y time=t supply_voltage=12"
-    record = read_records(path, [f"{mapping} pwm_full_scale=255"])["motor"]
+    columns = dict(t=T, pwm=np.abs(U) / 12 * 255, dir=direction, y=SPEED)
+    mapping = ["voltage=pwm:pwm direction=dir velocity=y time=t supply_voltage=12"]
+    record = read_table(tmp_path, [*mapping, "pwm_full_scale=255"], **columns)
     np.testing.assert_allclose(record.voltage[1:], U[:-1], rtol=1e-12)
-    with pytest.raises(BagError, match="needs pwm_full_scale"):
-        read_records(path, [mapping])
+    assert_refused("needs pwm_full_scale", tmp_path / "log.csv", mapping)
 
 
 @pytest.mark.parametrize("codes_of", [("F", "R"), ("fwd", "rev"), ("forwards", "backwards")])
 def test_direction_is_read_from_words(tmp_path, codes_of):
     ways = [codes_of[0] if u > 0 else codes_of[1] for u in U]
-    rows = [f"{t},{abs(u)},{way},{y}" for t, u, way, y in zip(T, U, ways, SPEED)]
-    (tmp_path / "log.csv").write_text("\n".join(["t,u,dir,y", *rows]))
-    record = read_records(tmp_path / "log.csv", ["voltage=u direction=dir velocity=y time=t"])
-    np.testing.assert_allclose(record["motor"].voltage[1:], U[:-1], rtol=1e-12)
+    record = read_table(tmp_path, [*MAP, "direction=dir"], t=T, u=np.abs(U), dir=ways, y=SPEED)
+    np.testing.assert_allclose(record.voltage[1:], U[:-1], rtol=1e-12)
 
 
 @pytest.mark.parametrize("still", [0, 1])  # a third code for standstill
 def test_ambiguous_direction_codes_are_refused(tmp_path, still):
     volts = U * (np.arange(N) % 40 >= 20 * still)
     direction = np.select([volts > 0, volts < 0], [1, 2], 0)
-    path = write(tmp_path / "log.csv", t=T, u=np.abs(volts), dir=direction, y=SPEED)
-    mapping = "voltage=u velocity=y time=t direction=dir"
-    with pytest.raises(BagError, match="1, 2, and which is backwards is unknown"):
-        read_records(path, [mapping])
-    record = read_records(path, [f"{mapping}*-1+1.5"])["motor"]
+    path = write_table(tmp_path / "log.csv", t=T, u=np.abs(volts), dir=direction, y=SPEED)
+    assert_refused("1, 2, and which is backwards is unknown", path, [*MAP, "direction=dir"])
+    record = read_one(path, [*MAP, "direction=dir*-1+1.5"])
     np.testing.assert_allclose(record.voltage[1:], volts[:-1], rtol=1e-12)
 
 
 def test_rim_speed_requires_wheel_radius(tmp_path):
-    path = write(tmp_path / "log.csv", t=T, u=U, y=0.03 * SPEED)
-    record = read_records(path, ["voltage=u velocity=y:m/s time=t wheel_radius=0.03"])["motor"]
+    mapping = ["voltage=u velocity=y:m/s time=t"]
+    record = read_table(tmp_path, [*mapping, "wheel_radius=0.03"], t=T, u=U, y=0.03 * SPEED)
     np.testing.assert_allclose(record.velocity, SPEED, atol=1e-12)
-    with pytest.raises(BagError, match="needs wheel_radius"):
-        read_records(path, ["voltage=u velocity=y:m/s time=t"])
+    assert_refused("needs wheel_radius", tmp_path / "log.csv", mapping)
 
 
 def test_pwm_beyond_full_scale_is_clipped_to_supply_voltage(tmp_path):
     rng = np.random.default_rng(5)
     pwm = rng.integers(-255, 256, 400)
     pwm[100:110] = 1000  # an unclipped controller output, or an error code
-    rows = [f"{0.01 * k},{u},{0.1 * k}" for k, u in enumerate(pwm)]
-    path = tmp_path / "log.csv"
-    path.write_text("\n".join(["t,pwm,w", *rows]))
     mapping = "time=t voltage=pwm:pwm velocity=w pwm_full_scale=255 supply_voltage=12 held=after"
-    record = read_records(path, [mapping])["motor"]
+    record = read_table(tmp_path, [mapping], t=T, pwm=pwm, w=10 * T)
     # A value held from its row on is the mean of the interval to the next row.
     np.testing.assert_allclose(record.voltage[1:], np.clip(pwm / 255 * 12, -12, 12)[:-1])
     (found,) = (f for f in record.findings if f.code == "beyond_full_scale")
@@ -171,17 +158,15 @@ def write_signed_command(folder: Path, direction: str) -> Path:
     pwm = np.repeat(rng.choice([-80, -40, 0, 40, 80], 30), 20)
     words = {1: "FWD", 0: "FWD", -1: "REV"}
     way = [words[int(np.sign(p))] if direction == "own" else "FWD" for p in pwm]
-    rows = [f"{0.01 * k:.2f},{p},{w},{0.3 * p}" for k, (p, w) in enumerate(zip(pwm, way))]
-    (folder / "log.csv").write_text("\n".join(["t,pwm,way,w", *rows]))
-    return folder / "log.csv"
+    time = 0.01 * np.arange(pwm.size)
+    return write_table(folder / "log.csv", t=time, pwm=pwm, way=way, w=0.3 * pwm)
 
 
 @pytest.mark.parametrize("direction", ["own", "one"])
 def test_direction_column_is_ignored_for_signed_command(tmp_path, direction):
     path = write_signed_command(tmp_path, direction)
     mapping = ["voltage=pwm:% supply_voltage=12 velocity=w time=t"]
-    plain = read_records(path, mapping)["motor"]
-    record = read_records(path, [*mapping, "direction=way"])["motor"]
+    plain, record = (read_one(path, [*mapping, *more]) for more in ((), ("direction=way",)))
     np.testing.assert_array_equal(record.voltage, plain.voltage)
     assert "leave it out" in next(
         f.message for f in record.findings if f.code == "direction_not_used"
@@ -216,7 +201,7 @@ def test_speed_command_mapped_as_voltage_is_reported(tmp_path, field, severity):
 def test_velocity_of_zero_during_motion_is_dropped(tmp_path, still):
     """UbiquityRobotics/ubiquity_motor issue 59: the position moves, the velocity is 0."""
     angle = np.zeros(N) if still else 0.01 * np.cumsum(SPEED)
-    path = write(tmp_path / "log.csv", t=T, u=U, p=angle, w=0 * angle)
-    record = read_records(path, ["voltage=u position=p velocity=w time=t"])["motor"]
+    mapping = ["voltage=u position=p velocity=w time=t"]
+    record = read_table(tmp_path, mapping, t=T, u=U, p=angle, w=0 * angle)
     assert (record.velocity is None) is not still
     assert ("velocity_not_filled" in codes(record)) is not still

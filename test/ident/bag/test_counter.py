@@ -8,12 +8,13 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from recordings import COUNTS, RATIO, motion, notes, read
+from recordings import COUNTS, RATIO, assert_refused, motion, notes, read, read_table, write_table
 
-from smp_motor_ident.bag import read_records
 from smp_motor_ident.bag.counter import Wrap, find_full_count, round_to_counts, unwrap, unwrap_angle
 from smp_motor_ident.errors import BagError
 from smp_motor_ident.record import Record
+
+MAP = "voltage=u count=c time=t counts_per_revolution"
 
 
 def simulate_counts(samples: int = 400, most: int = 90, seed: int = 3) -> np.ndarray:
@@ -336,10 +337,8 @@ def test_counter_saturated_at_end_of_range_is_detected(last):
 def test_angle_restarting_at_each_run_of_joined_log_begins_a_segment(tmp_path):
     voltage = np.repeat([3.0, 6.0, 0.0], 100)
     run = np.cumsum(voltage * 400.0) * 0.01  # degrees, from zero
-    table = np.column_stack([0.01 * np.arange(900), np.tile(voltage, 3), np.tile(run, 3)])
-    joined = tmp_path / "joined.csv"
-    np.savetxt(joined, table, delimiter=",", header="t,u,angle", comments="", fmt="%.6f")
-    record = read_records(joined, ["time=t", "voltage=u", "position=angle:deg"])["motor"]
+    columns = dict(t=0.01 * np.arange(900), u=np.tile(voltage, 3), angle=np.tile(run, 3))
+    record = read_table(tmp_path, ["time=t", "voltage=u", "position=angle:deg"], **columns)
     assert record.starts == (0, 300, 600)
     assert [f.evidence for f in record.findings if f.code == "counter_reset"] == [{"times": 2}]
     np.testing.assert_allclose(record.position[300:600], np.deg2rad(run), atol=1e-9)
@@ -350,29 +349,22 @@ def test_counts_far_from_zero_lose_no_resolution(tmp_path, offset):
     """The last offset makes an unsigned counter wrap."""
     true = simulate_counts()
     shown = [(n + offset) % 2**64 if offset > 2**63 else n + offset for n in true.tolist()]
-    rows = (f"{0.01 * k:.2f},{k % 5},{n}" for k, n in enumerate(shown))
-    (tmp_path / "log.csv").write_text("\n".join(["t,u,c", *rows]))
-    mapping = ["voltage=u count=c time=t counts_per_revolution=2000"]
-    record = read_records(tmp_path / "log.csv", mapping)["motor"]
+    k = np.arange(len(shown))
+    record = read_table(tmp_path, [f"{MAP}=2000"], t=0.01 * k, u=k % 5, c=shown)
     assert np.array_equal(record.count - record.count[0], true - true[0])
 
 
 def test_impossibly_fast_counts_are_refused(tmp_path):
-    rows = (f"{0.01 * k:.2f},8,{k**2 * 10**14}" for k in range(300))
-    (tmp_path / "log.csv").write_text("\n".join(["t,u,c", *rows]))
-    with pytest.raises(BagError, match="the count moves by"):
-        read_records(tmp_path / "log.csv", ["voltage=u count=c time=t counts_per_revolution=2000"])
+    k = np.arange(300)
+    path = write_table(tmp_path / "log.csv", t=0.01 * k, u=300 * [8], c=k**2 * 10**14)
+    assert_refused("the count moves by", path, [f"{MAP}=2000"])
 
 
 def test_a_refusal_of_counts_names_the_file(tmp_path):
-    counts = (
-        np.rint(simulate_wrapped_angle(1.5, 15.0, "levels") / (2 * np.pi) * 256).astype(np.int64)
-        % 256
-    )
-    rows = (f"{0.01 * k:.2f},{k % 5},{n}" for k, n in enumerate(counts.tolist()))
-    (tmp_path / "log.csv").write_text("\n".join(["t,u,c", *rows]))
-    with pytest.raises(BagError, match=r"log\.csv: the encoder's count turns by more than half"):
-        read_records(tmp_path / "log.csv", ["voltage=u count=c time=t counts_per_revolution=256"])
+    k = np.arange(2000)
+    path = write_table(tmp_path / "log.csv", t=0.01 * k, u=k % 5, c=simulate_aliased_counts())
+    message = r"log\.csv: the encoder's count turns by more than half"
+    assert_refused(message, path, [f"{MAP}=256"])
 
 
 def test_roundest_counter_width_within_uncertainty_is_chosen():
@@ -392,6 +384,12 @@ def simulate_wrapped_angle(top: float, lag: float, drive: str) -> np.ndarray:
     return np.mod(np.cumsum(speed), 2 * np.pi)
 
 
+def simulate_aliased_counts() -> np.ndarray:
+    """Return counts of 256 a turn that move by more than half a turn per sample."""
+    angle = simulate_wrapped_angle(1.5, 15.0, "levels")
+    return np.rint(angle / (2 * np.pi) * 256).astype(np.int64) % 256
+
+
 @pytest.mark.parametrize("drive", ["levels", "sine", "step"])
 @pytest.mark.parametrize("lag", [4.0, 15.0])
 def test_more_than_half_a_turn_per_sample_is_refused_as_aliasing(drive, lag):
@@ -409,10 +407,6 @@ def test_outliers_of_fast_angle_are_not_taken_for_aliasing(faults):
 
 
 def test_counter_moving_over_half_its_range_per_sample_is_refused():
-    counts = (
-        np.rint(simulate_wrapped_angle(1.5, 15.0, "levels") / (2 * np.pi) * 256).astype(np.int64)
-        % 256
-    )
     for bits in (8, None):
         with pytest.raises(BagError, match="turns by more than half of its 256"):
-            unwrap(counts, bits)
+            unwrap(simulate_aliased_counts(), bits)

@@ -3,10 +3,9 @@
 
 import pytest
 from bench_scripts import load
+from recordings import assert_refused
 
-from smp_motor_ident.bag import read_records
 from smp_motor_ident.bag.readers import apart
-from smp_motor_ident.errors import BagError
 
 HOSTILE = load("hostile")
 
@@ -29,5 +28,4 @@ def test_workbook_exceeding_time_limit_is_refused(tmp_path, monkeypatch):
     monkeypatch.setattr(apart, "TIMEOUT_S", 0.5)
     name, write, mapping = HOSTILE.CASES["xlsx: numbers"]
     write(tmp_path)
-    with pytest.raises(BagError, match="is not read after 1 s, too long for its size"):
-        read_records(tmp_path / name, mapping)
+    assert_refused("is not read after 1 s, too long for its size", tmp_path / name, mapping)

@@ -5,8 +5,8 @@ import time
 
 import numpy as np
 import pytest
+from recordings import read_table
 
-from smp_motor_ident.bag import read_records
 from smp_motor_ident.bag.drives import find_late_rows
 
 N = 2000
@@ -73,16 +73,14 @@ def test_delay_of_long_log_is_estimated_quickly():
 
 @pytest.mark.parametrize("motion", ["velocity", "count"])
 def test_late_voltage_is_moved_back_in_every_segment(tmp_path, motion):
-    voltage, path = DRIVES["levels"], tmp_path / "log.csv"
+    voltage = DRIVES["levels"]
     speed = simulate_speed(voltage)
     moved = speed if motion == "velocity" else np.rint(np.cumsum(speed) * 0.01 * 318)
     at = 0.01 * np.arange(N) + 60.0 * (np.arange(N) >= N // 2)
     late = np.concatenate([np.zeros(3), voltage[:-3]])
     late[N // 2 : N // 2 + 3] = 0.0
-    rows = (f"{a:.2f},{b:.6f},{c:.6f}" for a, b, c in zip(at, late, moved))
-    path.write_text("\n".join(["t,u,y", *rows]))
     mapping = [f"voltage=u {motion}=y time=t held=before counts_per_revolution=2000"]
-    record = read_records(path, mapping)["motor"]
+    record = read_table(tmp_path, mapping, t=at, u=late, y=moved)
     found = next(f for f in record.findings if f.code == "voltage_late")
     assert found.evidence == {"rows": 3, "late": pytest.approx(0.03)}
     assert "30 ms (3 rows) after it acts" in found.message

@@ -3,8 +3,9 @@
 
 import numpy as np
 import pytest
+from recordings import read_table
 
-from smp_motor_ident.bag import Signal, load_mapping, parse_mapping, read_records
+from smp_motor_ident.bag import Signal, load_mapping, parse_mapping
 from smp_motor_ident.bag.mapping import read_mapping
 from smp_motor_ident.errors import BagError
 
@@ -116,9 +117,8 @@ def test_missing_mapping_file_is_refused_by_name(tmp_path):
 
 
 def test_constant_voltage_is_given_in_mapping(tmp_path):
-    path = tmp_path / "step_12V.csv"
-    path.write_text("t,w\n" + "\n".join(f"{0.01 * k},{20 * k}" for k in range(30)))
-    record = read_records(path, ["voltage=w*0+12 velocity=w time=t"])["motor"]
+    mapping = ["voltage=w*0+12 velocity=w time=t"]
+    record = read_table(tmp_path, mapping, t=0.01 * np.arange(30), w=range(0, 600, 20))
     assert np.all(record.voltage == 12.0)
 
 

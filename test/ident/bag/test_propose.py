@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Mappings are proposed from field names confirmed by the data, and can be read."""
 
-from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -11,16 +10,17 @@ from recordings import (
     START,
     TYPES,
     Sent,
+    assert_refused,
     floats,
     follow,
     in_order,
     joint_state,
     serialized,
     write_mcap,
+    write_table,
 )
 
 from smp_motor_ident.bag import Listing, list_topics, read_records
-from smp_motor_ident.errors import BagError
 
 N = 600
 T = 0.01 * np.arange(N)
@@ -33,11 +33,10 @@ def motor(seed: int) -> tuple[np.ndarray, np.ndarray]:
     return voltage, follow(voltage) + rng.normal(0, 0.5, N)
 
 
-def write(path: Path, **columns: Sequence[float]) -> Path:
-    rows = zip(*columns.values())
-    lines = [";".join(columns), *(";".join(repr(float(v)) for v in row) for row in rows)]
-    path.write_text("\n".join(lines))
-    return path
+def write(path: Path, **columns: np.ndarray) -> Path:
+    return write_table(
+        path, ";", **{name: column.astype(float) for name, column in columns.items()}
+    )
 
 
 def test_mapping_of_two_wheels_is_proposed_and_pwm_full_scale_requested(tmp_path):
@@ -227,8 +226,7 @@ def test_proposed_electrical_speed_requests_pole_pairs(tmp_path):
     assert listing.suggestion[1] == "velocity=erpm:erpm"
     assert [text.partition("=")[0] for text in listing.asked] == ["supply_voltage", "pole_pairs"]
     mapping = ["voltage=duty_cycle:duty supply_voltage=12 velocity=erpm time=ms_today:ms"]
-    with pytest.raises(BagError, match="'erpm' needs pole_pairs of the motor"):
-        read_records(path, mapping)
+    assert_refused("'erpm' needs pole_pairs of the motor", path, mapping)
     record = read_records(path, [*mapping, "pole_pairs=7"])["motor"]
     np.testing.assert_allclose(record.velocity, speed * np.pi / 30 / 7, rtol=1e-9)
 
@@ -306,8 +304,11 @@ def test_columns_of_one_length_are_listed_and_proposed_together(tmp_path):
     items = ['voltage="id.InputData"', 'velocity="id.OutputData"', "time=t"]
     assert listing.suggestion == items
     assert len(read_records(tmp_path / "lab.mat", items)["motor"]) == N
-    with pytest.raises(BagError, match=r"differ in length: limits 2, .*map columns of one length"):
-        read_records(tmp_path / "lab.mat", ["voltage=limits", *items[1:]])
+    assert_refused(
+        r"differ in length: limits 2, .*map columns of one length",
+        tmp_path / "lab.mat",
+        ["voltage=limits", *items[1:]],
+    )
 
 
 def make_robot_messages(

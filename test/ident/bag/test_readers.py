@@ -13,6 +13,7 @@ import numpy as np
 import openpyxl
 import pytest
 import scipy.io
+from recordings import assert_refused
 from rosbags.rosbag1 import Writer
 from rosbags.typesys import Stores, get_typestore
 
@@ -140,13 +141,11 @@ def test_signals_in_rows_of_matlab_4_file_are_read(tmp_path):
 def test_invalid_or_truncated_matlab_file_is_refused(tmp_path):
     hdf = tmp_path / "new.mat"
     hdf.write_bytes(b"MATLAB 7.3 MAT-file, Platform: GLNXA64".ljust(512) + b"\x89HDF\r\n\x1a\n")
-    with pytest.raises(BagError, match=r"h5py|no readable MATLAB"):
-        read_records(hdf, MAP)
+    assert_refused(r"h5py|no readable MATLAB", hdf, MAP)
     whole = io.BytesIO()
     scipy.io.savemat(whole, {"t": TIME, "u": VOLTAGE, "y": SPEED}, do_compression=True)
     (tmp_path / "cut.mat").write_bytes(whole.getvalue()[:700])
-    with pytest.raises(BagError, match=r"cut\.mat: .*cut off"):
-        read_records(tmp_path / "cut.mat", MAP)
+    assert_refused(r"cut\.mat: .*cut off", tmp_path / "cut.mat", MAP)
 
 
 ENTRIES = ("/drive/left volts", "NT:left/speed")
@@ -283,8 +282,7 @@ def write_drivetrain(path: Path) -> Path:
 
 def test_sysid_drivetrain_in_metres_requires_only_wheel_radius(tmp_path):
     path = write_drivetrain(tmp_path / "sysid.json")
-    with pytest.raises(BagError, match="give --map wheel_radius=METRES"):
-        read_records(path)
+    assert_refused("give --map wheel_radius=METRES", path)
     records = read_records(path, ["wheel_radius=0.05"])
     np.testing.assert_allclose(records["left"].velocity, SPEED, atol=1e-9)
     np.testing.assert_allclose(records["right"].velocity, -SPEED, atol=1e-9)

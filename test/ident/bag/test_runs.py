@@ -5,11 +5,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from recordings import follow
+from recordings import assert_refused, codes, follow, read_one, write_table
 
 from smp_motor_ident.bag import list_topics, read_records
 from smp_motor_ident.bag.clock import split_into_runs
-from smp_motor_ident.errors import BagError
 from smp_motor_ident.record import Record
 
 MAP = ["voltage=u velocity=w time=t"]
@@ -24,17 +23,12 @@ def run(n: int, seed: int, begin: float = 0.0, hold: int = 10) -> np.ndarray:
     return np.stack([begin + STEP * np.arange(n), voltage, noisy], axis=1)
 
 
-def write(path: Path, rows: np.ndarray, names: str = "t,u,w") -> Path:
-    np.savetxt(path, rows, "%.6f", ",", header=names, comments="")
-    return path
+def write(path: Path, rows: np.ndarray, names: str = "tuw") -> Path:
+    return write_table(path, **dict(zip(names, rows.T)))
 
 
 def read(path: Path, rows: np.ndarray, mapping: list[str] = MAP) -> Record:
-    return read_records(write(path, rows), mapping)["motor"]
-
-
-def codes(record: Record) -> list[str]:
-    return [finding.code for finding in record.findings]
+    return read_one(write(path, rows), mapping)
 
 
 @pytest.mark.parametrize(
@@ -193,8 +187,8 @@ def test_tables_with_common_clock_are_split_at_the_same_restart(tmp_path):
     parts = [run(300, 1), run(300, 2)]
     rows = np.concatenate(parts)
     files = [
-        write(tmp_path / "set.csv", np.concatenate([p[:, :2] for p in parts]), "t,u"),
-        write(tmp_path / "state.csv", rows[:, [0, 2]], "t,w"),
+        write(tmp_path / "set.csv", np.concatenate([p[:, :2] for p in parts]), "tu"),
+        write(tmp_path / "state.csv", rows[:, [0, 2]], "tw"),
     ]
     record = read_records(files, ["voltage=/set.u velocity=/state.w time=t"])["motor"]
     assert record.starts == (0, 300)
@@ -205,11 +199,14 @@ def test_tables_with_common_clock_are_split_at_the_same_restart(tmp_path):
 def test_tables_with_different_clock_restarts_are_refused(tmp_path):
     rows = np.concatenate([run(300, 1), run(300, 2)])
     files = [
-        write(tmp_path / "set.csv", run(600, 3)[:, :2], "t,u"),
-        write(tmp_path / "state.csv", rows[:, [0, 2]], "t,w"),
+        write(tmp_path / "set.csv", run(600, 3)[:, :2], "tu"),
+        write(tmp_path / "state.csv", rows[:, [0, 2]], "tw"),
     ]
-    with pytest.raises(BagError, match=r"0 times in /set, 1 times in /state.*files of its own"):
-        read_records(files, ["voltage=/set.u velocity=/state.w time=t"])
+    assert_refused(
+        r"0 times in /set, 1 times in /state.*files of its own",
+        files,
+        ["voltage=/set.u velocity=/state.w time=t"],
+    )
 
 
 def test_file_of_several_runs_is_joined_with_other_files(tmp_path):

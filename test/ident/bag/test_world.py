@@ -5,9 +5,9 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
+from recordings import assert_refused, codes, read_one, read_table, write_table
 
 from smp_motor_ident.bag import read_records
-from smp_motor_ident.errors import BagError
 
 N = 300
 T = 0.01 * np.arange(N)
@@ -72,19 +72,14 @@ def test_tables_of_common_loggers_are_read(tmp_path, name):
     np.testing.assert_allclose(record.time, T, atol=1e-6)  # float64 since 1970: 0.2 us
     np.testing.assert_array_equal(record.voltage[1:], U[:-1])
     np.testing.assert_array_equal(record.velocity, Y)
-    assert [f.code for f in record.findings if f.code != "gear_ratio_assumed"] == [code] * bool(
-        code
-    )
+    assert [c for c in codes(record) if c != "gear_ratio_assumed"] == [code] * bool(code)
 
 
 def test_command_and_state_files_are_merged_by_time(tmp_path):
-    (tmp_path / "set.csv").write_text(
-        text([f"{t:.3f},{u!r}" for t, u in zip(T, U.tolist())], "t,u")
-    )
-    state = [f"{1e3 * t + 4:.0f},{y!r}" for t, y in zip(T, Y.tolist())]
-    (tmp_path / "state.csv").write_text(text(state, "time_ms,w"))
-    (tmp_path / "other.csv").write_text("a,b\n1,2\n3,4\n")
-    record = read_records(tmp_path, ["voltage=/set.u velocity=/state.w time=t"])["motor"]
+    write_table(tmp_path / "set.csv", t=T, u=U)
+    write_table(tmp_path / "state.csv", time_ms=1e3 * T + 4, w=Y)
+    write_table(tmp_path / "other.csv", a=[1, 3], b=[2, 4])
+    record = read_one(tmp_path, ["voltage=/set.u velocity=/state.w time=t"])
     assert record.source == "set+state"
     np.testing.assert_array_equal(record.velocity, Y)
     # In each 10 ms interval the previous voltage holds for 6 ms, the next one for 4 ms.
@@ -94,13 +89,10 @@ def test_command_and_state_files_are_merged_by_time(tmp_path):
 def test_table_with_too_many_text_lines_is_refused_by_line(tmp_path):
     lines = [line if k % 10 else "Brown-out!" for k, line in enumerate(rows())]
     (tmp_path / "log.csv").write_text(text(lines))
-    with pytest.raises(BagError, match="line 12, column 't': 'Brown-out!' is not a number"):
-        read_records(tmp_path / "log.csv", [MAP])
+    assert_refused("line 12, column 't': 'Brown-out!' is not a number", tmp_path / "log.csv", [MAP])
 
 
 def test_step_at_first_row_is_kept(tmp_path):
-    lines = [f"{t:.2f},6,{60 * (1 - np.exp(-t / 0.1)):.6f}" for t in T]
-    (tmp_path / "log.csv").write_text(text(lines))
-    record = read_records(tmp_path / "log.csv", [MAP])["motor"]
+    record = read_table(tmp_path, [MAP], t=T, u=N * [6], y=60 * (1 - np.exp(-T / 0.1)))
     assert len(record) == N and record.voltage[0] == 6.0 and record.velocity is not None
     assert record.velocity[0] == 0.0
