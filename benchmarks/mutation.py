@@ -38,8 +38,7 @@ ROOT = Path(__file__).resolve().parents[1]
 LEAST = 0.85
 CONTROL, BAG = "smp_motor_control.", "smp_motor_ident.bag."
 TESTS = {
-    CONTROL + "pid": "control/test_pid_law.py control/test_pid.py "
-                     "control/test_pid_conformance.py",
+    CONTROL + "pid": "control/test_pid_law.py control/test_pid_conformance.py",
     CONTROL + "encoder": "control/test_encoder.py",
     CONTROL + "wheel.freshness": "control/test_supervision.py",
     CONTROL + "wheel.faults": "control/test_fault_detector.py control/test_supervision.py",

@@ -92,7 +92,7 @@ PY
   run commission "$bin/commission" --output trial --amplitude 6 --dry-run || { kill "$plant"; exit 1; }
   kill -INT "$plant"; wait "$plant" || fail "motor_plant ended with $?"
   run test colcon test --packages-select smp_motor_control \
-    --pytest-args test/control/test_pid.py test/control/test_skid_steer.py test/system/test_robots.py
+    --pytest-args test/control/test_pid_law.py test/control/test_skid_steer.py test/system/test_robots.py
   colcon test-result --verbose | tail -3
   colcon test-result | grep -qE "[1-9][0-9]* tests?, 0 errors, 0 failures" || fail "colcon test-result counts no tests"
 }

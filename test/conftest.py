@@ -13,6 +13,7 @@ from pathlib import Path
 
 import hypothesis
 import pytest
+from browser import CHROMIUM, Browser
 from processes import BUSY, TestProcess, own_domain, processes
 from wheel_robot import WheelRobot
 
@@ -74,6 +75,22 @@ def robot(ros_domain: int) -> Iterator[WheelRobot]:
     robot = WheelRobot(ros_domain)
     yield robot
     robot.close()
+
+
+@pytest.fixture(scope="module")
+def opened_browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
+    if not CHROMIUM:
+        pytest.skip("no Chromium on this machine")
+    with Browser(tmp_path_factory.mktemp("profile")) as opened:
+        yield opened
+
+
+@pytest.fixture
+def browser(opened_browser: Browser) -> Browser:
+    """Return the browser of the test's file, without complaints or requests so far."""
+    opened_browser.complaints.clear()
+    opened_browser.requests.clear()
+    return opened_browser
 
 
 @pytest.fixture(scope="session")

@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from browser import CHROMIUM, Browser
 from recordings import write_steps
 
 from smp_motor_ident.cli import fleet as command
@@ -153,8 +152,7 @@ def test_recording_date_is_read_and_results_are_printed_with_units(tmp_path, cap
     )
 
 
-@pytest.mark.skipif(not CHROMIUM, reason="no Chromium on this machine")
-def test_fleet_table_fits_screen_and_phone_widths(tmp_path):
+def test_fleet_table_fits_screen_and_phone_widths(tmp_path, browser):
     units = {"dc_gain": "rad/s/V", "time_constant": "s", "static_voltage": "V", "resistance": "ohm"}
     numbers = {
         name: Quantity(25.54832, 0.00079, (25.54678, 25.54986), unit)
@@ -164,11 +162,10 @@ def test_fleet_table_fits_screen_and_phone_widths(tmp_path):
     file = tmp_path / "fleet.html"
     file.write_text(page([row, replace(row, wheel="rear_left", failure="it stood still")], []))
     cells = "[...document.querySelectorAll('td')].map(c => c.getBoundingClientRect())"
-    with Browser(tmp_path / "profile") as browser:
-        for width in (1280, 1000, 720, 390):
-            browser.open(file, width)
-            assert browser.value("document.documentElement.scrollWidth") <= width
-            assert browser.value(f"Math.max(...{cells}.map(c => c.right))") <= width
-            text = browser.value("document.querySelector('tbody tr').textContent")
-            assert "25.54832 ± 0.00079 25.54678 … 25.54986" in text
-            assert browser.complaints == []
+    for width in (1280, 1000, 720, 390):
+        browser.open(file, width)
+        assert browser.value("document.documentElement.scrollWidth") <= width
+        assert browser.value(f"Math.max(...{cells}.map(c => c.right))") <= width
+        text = browser.value("document.querySelector('tbody tr').textContent")
+        assert "25.54832 ± 0.00079 25.54678 … 25.54986" in text
+        assert browser.complaints == []

@@ -14,7 +14,6 @@ from subprocess import PIPE
 
 import numpy as np
 import pytest
-from browser import CHROMIUM, Browser
 from recordings import write_steps
 
 from smp_motor_control.motor.file import load_motors
@@ -78,19 +77,17 @@ def test_identify_writes_its_three_files_and_recovers_the_motor(recording, tmp_p
 UNITS = {"ms": 1e-3, "ms²": 1e-6}
 
 
-@pytest.mark.skipif(not CHROMIUM, reason="no Chromium on this machine")
-def test_terminal_json_and_page_state_the_same_numbers(recording, tmp_path, capsys):
+def test_terminal_json_and_page_state_the_same_numbers(recording, tmp_path, capsys, browser):
     output = tmp_path / "result"
     assert main([str(recording), *MAP, "--output", str(output)]) == 0
     terminal = capsys.readouterr().out
     (motor,) = json.loads((output / "identification.json").read_text())["motors"].values()
-    with Browser(tmp_path / "profile") as browser:
-        browser.open(output / "report.html", 1280)
-        rows: list[list[str]] = browser.value(
-            "[...document.querySelectorAll('.values tbody tr')].map(r => [r.children[0].firstChild"
-            ".textContent.trim(), r.children[1].textContent])"
-        )
-        fit = browser.value("document.querySelector('.fit').textContent")
+    browser.open(output / "report.html", 1280)
+    rows: list[list[str]] = browser.value(
+        "[...document.querySelectorAll('.values tbody tr')].map(r => [r.children[0].firstChild"
+        ".textContent.trim(), r.children[1].textContent])"
+    )
+    fit = browser.value("document.querySelector('.fit').textContent")
     assert fit in " ".join(terminal.split())
     assert f"{motor['fit_percent']['validation']:.1f} %" in fit
     page = dict(rows)

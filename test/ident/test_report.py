@@ -9,7 +9,6 @@ from html.parser import HTMLParser
 
 import numpy as np
 import pytest
-from browser import CHROMIUM, Browser
 from results import PHYSICAL, comparison, correlation, estimate, tuning_of_two
 from scipy.signal import lfilter
 
@@ -138,35 +137,33 @@ def test_each_chart_has_a_static_drawing_with_an_accessible_label(page):
     )
 
 
-@pytest.mark.skipif(not CHROMIUM, reason="no Chromium on this machine")
-def test_browser_draws_and_zooms_every_chart_without_network_requests(page, tmp_path):
+def test_browser_draws_and_zooms_every_chart_without_network_requests(page, tmp_path, browser):
     file = tmp_path / "report.html"
     file.write_text(page)
-    with Browser(tmp_path / "profile") as browser:
-        for width, dark in ((1200, False), (390, True)):
-            browser.open(file, width, dark=dark)
-            # Folded charts are drawn when opened.
-            figures = browser.value("document.querySelectorAll('figure.chart').length")
-            assert 0 < browser.value("document.querySelectorAll('figure.ready').length") < figures
-            browser.unfold()
-            for inside in ("figure.ready", "figure canvas"):
-                assert browser.value(f"document.querySelectorAll('{inside}').length") == figures
-            assert browser.value("document.documentElement.scrollWidth") <= width
-        # Speed, residual and voltage share their time: all three show the zoomed stretch.
-        browser.value("document.querySelector('button[data-key=\"0\"]').click()")
-        browser.value("document.querySelector('button[data-key=\"+\"]').click()")
-        browser.drawn()
-        shown = "[...document.querySelectorAll('.live')].slice(0, 3).map(e => e.dataset.shown)"
-        first, *others = browser.value(shown)
-        begin, end = map(float, first.split())
-        assert others == [first, first]
-        # Two stretches of 4000 samples at 5 ms; the page shows the middle half.
-        assert (begin, end) == pytest.approx((10.0, 30.0), abs=0.1)
-        assert browser.complaints == []
-        assert set(browser.requests) == {file.as_uri()}
+    for width, dark in ((1200, False), (390, True)):
+        browser.open(file, width, dark=dark)
+        # Folded charts are drawn when opened.
+        figures = browser.value("document.querySelectorAll('figure.chart').length")
+        assert 0 < browser.value("document.querySelectorAll('figure.ready').length") < figures
+        browser.unfold()
+        for inside in ("figure.ready", "figure canvas"):
+            assert browser.value(f"document.querySelectorAll('{inside}').length") == figures
+        assert browser.value("document.documentElement.scrollWidth") <= width
+    # Speed, residual and voltage share their time: all three show the zoomed stretch.
+    browser.value("document.querySelector('button[data-key=\"0\"]').click()")
+    browser.value("document.querySelector('button[data-key=\"+\"]').click()")
+    browser.drawn()
+    shown = "[...document.querySelectorAll('.live')].slice(0, 3).map(e => e.dataset.shown)"
+    first, *others = browser.value(shown)
+    begin, end = map(float, first.split())
+    assert others == [first, first]
+    # Two stretches of 4000 samples at 5 ms; the page shows the middle half.
+    assert (begin, end) == pytest.approx((10.0, 30.0), abs=0.1)
+    assert browser.complaints == []
+    assert set(browser.requests) == {file.as_uri()}
 
 
-def test_tuning_sliders_select_precomputed_designs(tmp_path, monkeypatch):
+def test_tuning_sliders_select_precomputed_designs(tmp_path, monkeypatch, request):
     tuning = tuning_of_two(monkeypatch, estimate())
     soft, own = tuning.choices
     assert tuning.chosen == 1
@@ -178,25 +175,23 @@ def test_tuning_sliders_select_precomputed_designs(tmp_path, monkeypatch):
             for one, shown in zip((soft, own), held["choices"])
             if one.design] == [True, True]  # fmt: skip
 
-    if not CHROMIUM:
-        pytest.skip("no Chromium on this machine")
+    browser = request.getfixturevalue("browser")
     file = tmp_path / "report.html"
     file.write_text(render(Report({"front_left": estimate()}, tunings={"front_left": tuning})))
-    with Browser(tmp_path / "profile") as browser:
-        browser.open(file, 390, dark=True)
-        yaml = "document.getElementById('tuning-yaml').textContent"
-        assert browser.value(yaml) == held["choices"][1]["yaml"]
-        slider = "document.getElementById('tuning-bandwidth')"
-        browser.value(f"{slider}.value = 0, {slider}.dispatchEvent(new Event('input'))")
-        assert browser.value(yaml) == held["choices"][0]["yaml"]
-        # A chart that is unfolded later shows the design of the slider.
-        browser.value("document.querySelector('#tuning details').open = true")
-        frame = "new Promise(done => setTimeout(done))"
-        browser.ask("Runtime.evaluate", awaitPromise=True, expression=frame)
-        assert "ready" in browser.value("document.getElementById('figure-tuning-gain').className")
-        assert browser.value("document.documentElement.scrollWidth") <= 390
-        assert browser.complaints == []
-        assert set(browser.requests) == {file.as_uri()}
+    browser.open(file, 390, dark=True)
+    yaml = "document.getElementById('tuning-yaml').textContent"
+    assert browser.value(yaml) == held["choices"][1]["yaml"]
+    slider = "document.getElementById('tuning-bandwidth')"
+    browser.value(f"{slider}.value = 0, {slider}.dispatchEvent(new Event('input'))")
+    assert browser.value(yaml) == held["choices"][0]["yaml"]
+    # A chart that is unfolded later shows the design of the slider.
+    browser.value("document.querySelector('#tuning details').open = true")
+    frame = "new Promise(done => setTimeout(done))"
+    browser.ask("Runtime.evaluate", awaitPromise=True, expression=frame)
+    assert "ready" in browser.value("document.getElementById('figure-tuning-gain').className")
+    assert browser.value("document.documentElement.scrollWidth") <= 390
+    assert browser.complaints == []
+    assert set(browser.requests) == {file.as_uri()}
 
 
 def test_residual_charts_show_the_values_of_the_residual_tests():

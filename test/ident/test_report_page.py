@@ -1,21 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
 """Layout of the report: its length, its order and its first view."""
 
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
-from browser import CHROMIUM, Browser
+from browser import Browser
 from results import comparison, estimate
 
 from smp_motor_ident.finding import Finding
 from smp_motor_ident.report.figures import Comparison
 from smp_motor_ident.report.html import Report, render
 from smp_motor_ident.result import Estimate, Quantity, Share
-
-pytestmark = pytest.mark.skipif(not CHROMIUM, reason="no Chromium on this machine")
 
 WHEELS = ("front_left", "front_right", "rear_left", "rear_right")
 LONG = "the voltage has one size, 3 V: " + ", ".join(["a driver that looks like another motor"] * 5)
@@ -46,12 +43,6 @@ def make_full_result(wheel: str) -> Estimate:
 def drive() -> list[Comparison]:
     """Return 40 s under a square-wave voltage, with the last third held out."""
     return [comparison("estimation", 27.0), comparison("validation", 13.0)]
-
-
-@pytest.fixture(scope="module")
-def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
-    with Browser(tmp_path_factory.mktemp("profile")) as opened:
-        yield opened
 
 
 @pytest.fixture(scope="module")

@@ -14,7 +14,7 @@ from collections.abc import Iterator
 
 import pytest
 import yaml
-from browser import AXE, CHROMIUM, Browser, Clicks, violations
+from browser import AXE, Clicks, violations
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from domain_node import DomainNode
 from wheel_robot import two_wheeled
@@ -315,93 +315,91 @@ def test_wheel_name_with_html_is_refused(process):
     assert "<img" in lab.output and "Traceback" not in lab.output
 
 
-@pytest.mark.skipif(not CHROMIUM, reason="no Chromium on this machine")
-def test_whole_procedure_works_by_clicks(two_wheels, eventually, tmp_path):
+def test_whole_procedure_works_by_clicks(two_wheels, eventually, tmp_path, browser):
     lab, watching = two_wheels
     url = address(lab, eventually)
     results = tmp_path / "lab_output"
-    with Browser(tmp_path / "profile") as browser:
-        page = Clicks(browser)
-        browser.open(url, 1280)
-        page.until("Number(document.body.dataset.frames) >= 10")
-        for name in ("excite", "identify", "tune", "apply", "step", "keep", "back"):
-            assert page.value(f"document.getElementById('{name}').disabled"), name
-        assert max(map(abs, watching.speeds())) < STANDSTILL
-        # A message is shown as text even if it contains HTML.
-        evil = "<img src=x onerror=window.broken=1>"
-        status = DiagnosticStatus(name="left/wheel_pid", message=evil, level=b"\1")
-        shown = f"document.querySelector('#diagnostics').textContent.includes({evil!r})"
+    page = Clicks(browser)
+    browser.open(url, 1280)
+    page.until("Number(document.body.dataset.frames) >= 10")
+    for name in ("excite", "identify", "tune", "apply", "step", "keep", "back"):
+        assert page.value(f"document.getElementById('{name}').disabled"), name
+    assert max(map(abs, watching.speeds())) < STANDSTILL
+    # A message is shown as text even if it contains HTML.
+    evil = "<img src=x onerror=window.broken=1>"
+    status = DiagnosticStatus(name="left/wheel_pid", message=evil, level=b"\1")
+    shown = f"document.querySelector('#diagnostics').textContent.includes({evil!r})"
 
-        def is_shown() -> bool:  # wheel_pid reports itself every second
-            watching.reports.publish(DiagnosticArray(status=[status]))
-            return bool(page.value(shown))
+    def is_shown() -> bool:  # wheel_pid reports itself every second
+        watching.reports.publish(DiagnosticArray(status=[status]))
+        return bool(page.value(shown))
 
-        eventually(is_shown, 30.0)
-        assert page.value("document.images.length + (window.broken || 0)") == 0
+    eventually(is_shown, 30.0)
+    assert page.value("document.images.length + (window.broken || 0)") == 0
 
-        page.set("seconds", 8)
-        recorded = "document.getElementById('recordings').innerText.includes('recording_')"
-        stopped = "document.getElementById('messages').innerText.includes('exciting was stopped')"
-        for _ in range(4):  # a busy machine may not hear the page for 0.3 s, which stops the wheels
-            page.arm()
-            page.click("excite")
-            page.until("document.getElementById('job').innerText.startsWith('Exciting')")
-            page.until(f"{recorded} || {stopped}")
-            if page.value(recorded):
-                break
-        page.click("identify")
-        page.until("document.getElementById('motors').innerText.includes('identified')", 240.0)
-        folder = next(results.glob("identification_*"))
-        shown = page.text("motors")
-        for estimate in read_identification(folder).values():
-            for quantity in estimate.combinations.values():
-                assert words.state(quantity) in shown
-        page.value("document.getElementById('report').parentElement.open = true")
-        page.until(f"document.getElementById('report').src.endsWith('{folder.name}/report.html')")
-
-        page.click("tune")
-        page.until("document.querySelectorAll('#rows tr').length > 5", 240.0)
-        (gains,) = results.glob("gains_*.yaml")
-        own = tmp_path / "own.yaml"
-        done = subprocess.run(["tune", folder, "--output", own], capture_output=True, check=False)
-        assert done.returncode == 0, done.stderr
-        assert yaml.safe_load(gains.read_text()) == yaml.safe_load(own.read_text())
-        page.set("share", 0.6)
-        page.until("document.getElementById('yaml').dataset.ms !== ''")
-        slower = float(page.text("share-shown").split()[0])
-        page.set("i", 1e6)
-        page.until("document.getElementById('reason').innerText.includes('unstable')")
-        page.set("share", 1.0)
-        page.until(f"parseFloat(document.getElementById('share-shown').innerText) > {slower}")
-
-        for wheel in ("left", "right"):
-            page.set("wheel", wheel, "change")
-            page.arm()
-            page.click("apply")
-            page.until("document.getElementById('trial').innerText.startsWith('On trial')")
-            page.click("keep")
-            page.until("document.getElementById('trial').innerText === ''")
+    page.set("seconds", 8)
+    recorded = "document.getElementById('recordings').innerText.includes('recording_')"
+    stopped = "document.getElementById('messages').innerText.includes('exciting was stopped')"
+    for _ in range(4):  # a busy machine may not hear the page for 0.3 s, which stops the wheels
         page.arm()
-        page.value("document.getElementById('pad').focus()")
-        page.press("keyDown", "ArrowUp")
-        eventually(lambda: min(watching.speeds()) > 1.9, 10.0)
-        time.sleep(0.5)
-        assert all(abs(v - 2.0) < 0.1 for v in watching.speeds())  # 0.2 m/s on wheels of 0.1 m
-        stopped = time.time()
-        page.press("keyDown", " ")
-        page.press("keyUp", "ArrowUp")
-        time.sleep(1.0)
-        assert watching.stood_after(stopped) < WITHIN_S
-        assert page.text("arm") == "Arm"
-        for width, dark in ((390, True), (1280, False), (1920, True), (390, False)):
-            browser.resize(width, dark=dark)
-            browser.drawn()
-            top = "document.getElementById('identify-title').getBoundingClientRect().top"
-            before = page.value(top)
-            page.until("Number(document.body.dataset.frames) > 0")
-            assert page.value(top) == before  # nothing jumps while data stream
-            assert page.value("document.documentElement.scrollWidth") <= width
-            assert AXE is None or violations(browser) == []
-        assert browser.complaints == []
+        page.click("excite")
+        page.until("document.getElementById('job').innerText.startsWith('Exciting')")
+        page.until(f"{recorded} || {stopped}")
+        if page.value(recorded):
+            break
+    page.click("identify")
+    page.until("document.getElementById('motors').innerText.includes('identified')", 240.0)
+    folder = next(results.glob("identification_*"))
+    shown = page.text("motors")
+    for estimate in read_identification(folder).values():
+        for quantity in estimate.combinations.values():
+            assert words.state(quantity) in shown
+    page.value("document.getElementById('report').parentElement.open = true")
+    page.until(f"document.getElementById('report').src.endsWith('{folder.name}/report.html')")
+
+    page.click("tune")
+    page.until("document.querySelectorAll('#rows tr').length > 5", 240.0)
+    (gains,) = results.glob("gains_*.yaml")
+    own = tmp_path / "own.yaml"
+    done = subprocess.run(["tune", folder, "--output", own], capture_output=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert yaml.safe_load(gains.read_text()) == yaml.safe_load(own.read_text())
+    page.set("share", 0.6)
+    page.until("document.getElementById('yaml').dataset.ms !== ''")
+    slower = float(page.text("share-shown").split()[0])
+    page.set("i", 1e6)
+    page.until("document.getElementById('reason').innerText.includes('unstable')")
+    page.set("share", 1.0)
+    page.until(f"parseFloat(document.getElementById('share-shown').innerText) > {slower}")
+
+    for wheel in ("left", "right"):
+        page.set("wheel", wheel, "change")
+        page.arm()
+        page.click("apply")
+        page.until("document.getElementById('trial').innerText.startsWith('On trial')")
+        page.click("keep")
+        page.until("document.getElementById('trial').innerText === ''")
+    page.arm()
+    page.value("document.getElementById('pad').focus()")
+    page.press("keyDown", "ArrowUp")
+    eventually(lambda: min(watching.speeds()) > 1.9, 10.0)
+    time.sleep(0.5)
+    assert all(abs(v - 2.0) < 0.1 for v in watching.speeds())  # 0.2 m/s on wheels of 0.1 m
+    stopped = time.time()
+    page.press("keyDown", " ")
+    page.press("keyUp", "ArrowUp")
+    time.sleep(1.0)
+    assert watching.stood_after(stopped) < WITHIN_S
+    assert page.text("arm") == "Arm"
+    for width, dark in ((390, True), (1280, False), (1920, True), (390, False)):
+        browser.resize(width, dark=dark)
+        browser.drawn()
+        top = "document.getElementById('identify-title').getBoundingClientRect().top"
+        before = page.value(top)
+        page.until("Number(document.body.dataset.frames) > 0")
+        assert page.value(top) == before  # nothing jumps while data stream
+        assert page.value("document.documentElement.scrollWidth") <= width
+        assert AXE is None or violations(browser) == []
+    assert browser.complaints == []
     lab.interrupt()
     lab.wait(30.0)
