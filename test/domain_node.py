@@ -2,9 +2,11 @@
 """A node of a test in its own ROS domain, spun by the test."""
 
 import time
+from typing import Any
 
 import rclpy
 from rclpy.executors import SingleThreadedExecutor
+from rclpy.qos import DurabilityPolicy, QoSProfile
 
 
 class DomainNode:
@@ -19,6 +21,13 @@ class DomainNode:
 
     def spin(self) -> None:
         self.executor.spin_once(timeout_sec=0.005)
+
+    def hear(self, topic: str, kind: type) -> list[Any]:
+        """Return the messages of a topic, those sent earlier and kept for late readers first."""
+        heard: list[Any] = []
+        latched = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+        self.node.create_subscription(kind, topic, heard.append, latched)
+        return heard
 
     def spin_for(self, seconds: float) -> None:
         end = time.monotonic() + seconds

@@ -197,26 +197,23 @@ def write_file(path: Path, messages: Iterable[Sent], **options: Any) -> Path:
     return (write_sqlite if path.suffix == ".db3" else write_mcap)(path, messages, **options)
 
 
-def write_mcap(
-    path, messages, *, defined=True, encode=bytes, profile="ros2", finish=True, **options
-):
-    """Write an .mcap file with the mcap library."""
+def write_mcap(path, messages, *, define=definition, encoding="ros2msg", encode=bytes, **options):
+    """Write an .mcap file with the mcap library; ``define`` gives the definition of a type."""
     path.parent.mkdir(exist_ok=True)
     options.setdefault("chunk_size", 4096)
     options.setdefault("compression", mcap.writer.CompressionType.NONE)
     with path.open("wb") as file:
         writer = mcap.writer.Writer(file, **options)
-        writer.start(profile)
+        writer.start("ros2")
         channels: dict[tuple[str, str], int] = {}
         for sent in messages:
             key = (sent.topic, sent.type)
             if key not in channels:
-                text = definition(sent.type) if defined else ""
-                schema = writer.register_schema(sent.type, "ros2msg", text.encode())
+                text = define(sent.type).encode()
+                schema = writer.register_schema(sent.type, encoding, text)
                 channels[key] = writer.register_channel(sent.topic, "cdr", schema)
             writer.add_message(channels[key], sent.stamp, encode(sent.data), sent.stamp)
-        if finish:
-            writer.finish()
+        writer.finish()
     return path
 
 

@@ -7,7 +7,6 @@ import time
 from pathlib import Path
 
 import pytest
-from rclpy.qos import DurabilityPolicy, QoSProfile
 from std_msgs.msg import String
 
 from smp_interfaces.msg import MotorCommand, MotorDescription, MotorParameters
@@ -21,11 +20,7 @@ def test_plant_follows_commands_times_out_and_publishes_description(process, rob
     eventually(lambda: len(front) > 20, 20.0, robot.spin, "no feedback")
     assert all(m.voltage == 0.0 and m.encoder_count == 0 for m in front)
 
-    described: list[MotorDescription] = []
-    late = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-    robot.node.create_subscription(
-        MotorDescription, "/front_left/motor_description", described.append, late
-    )
+    described = robot.hear("/front_left/motor_description", MotorDescription)
     eventually(lambda: described, 10.0, robot.spin, "no description for the late")
     assert described[0].gear_ratio == 65.5 and described[0].resistance == 12.919
     assert described[0].joint_name == front[-1].header.frame_id == "front_left_wheel_joint"
@@ -83,11 +78,7 @@ def test_wheel_obeys_one_writer_until_its_lease_ends(process, robot, eventually)
     process("motor_plant", "--ros-args", "-p", "rate:=100.0")
     front = robot.states["front_left"]
     eventually(lambda: len(front) > 20, 20.0, robot.spin, "no feedback")
-    owners: list[str] = []
-    latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-    robot.node.create_subscription(
-        String, "/front_left/motor_owner", lambda m: owners.append(m.data), latched
-    )
+    owners = robot.hear("/front_left/motor_owner", String)
     send = robot.node.create_publisher(MotorCommand, "/front_left/motor_command", 10)
     eventually(lambda: send.get_subscription_count() and owners, 10.0, robot.spin)
 
@@ -104,11 +95,11 @@ def test_wheel_obeys_one_writer_until_its_lease_ends(process, robot, eventually)
     command(first=6.0, second=-6.0, third=0.0)
     # All six tenths of a second at 6 V, to half a step of the PWM.
     assert min(m.voltage for m in front[-20:]) > 5.98
-    assert owners[-1] == "first"
+    assert owners[-1].data == "first"
     eventually(lambda: robot.named("motor_plant", "another node owns the wheel"), 3.0, robot.spin)
     command(first=0.0, second=-6.0)
-    assert owners[-1] == "second" and front[-1].voltage == pytest.approx(-6.0, abs=0.013)
-    eventually(lambda: owners[-1] == "", 3.0, robot.spin, "the lease does not end")
+    assert owners[-1].data == "second" and front[-1].voltage == pytest.approx(-6.0, abs=0.013)
+    eventually(lambda: owners[-1].data == "", 3.0, robot.spin, "the lease does not end")
 
 
 def test_excite_stays_within_amplitude_and_ends_at_zero_volts(process, robot, eventually):
@@ -177,11 +168,7 @@ TRUE_GAIN = 25.548
 
 
 def test_accurate_estimate_is_published_after_sufficient_excitation(process, robot, eventually):
-    heard: list[MotorParameters] = []
-    latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-    robot.node.create_subscription(
-        MotorParameters, "/front_left/motor_parameters", heard.append, latched
-    )
+    heard = robot.hear("/front_left/motor_parameters", MotorParameters)
     process("motor_plant")
     settings = ["-p", "period:=1.0", "-p", "window:=12.0", "-p", "wheels:=[front_left]"]
     identifier = process("identifier", "--ros-args", *settings)

@@ -10,26 +10,77 @@ from itertools import chain
 from pathlib import Path
 from typing import Any
 
-import mcap.writer
 import pytest
 from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.serialization import serialize_message
+from recordings import Sent, write_mcap
+from rosbags.rosbag2 import Reader
 from rosgraph_msgs.msg import Clock
 from std_msgs.msg import Float64, String
-from traffic import (
-    BEST_EFFORT,
-    LATCHED,
-    RELIABLE,
-    WHEELS,
-    all_states,
-    contents,
-    publish_steadily,
-    raw,
-    so_far,
-)
 
 from smp_interfaces.msg import MotorDescription, MotorState
+from smp_motor_control import WHEELS
 from smp_motor_ident.bag import BagWriter, read_records
 from smp_motor_ident.errors import BagError
+
+BEGIN = time.time_ns()
+RELIABLE = QoSProfile(depth=5000, reliability=ReliabilityPolicy.RELIABLE)
+BEST_EFFORT = QoSProfile(depth=1000, reliability=ReliabilityPolicy.BEST_EFFORT)
+LATCHED = QoSProfile(
+    depth=5, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL
+)
+
+
+def state(number: int) -> MotorState:
+    message = MotorState()
+    # The instant of sampling, 1 ms apart however late a busy machine publishes.
+    stamp = BEGIN + number * 10**6
+    message.header.stamp.sec, message.header.stamp.nanosec = divmod(stamp, 10**9)
+    message.header.frame_id = "x_wheel_joint"
+    message.voltage, message.velocity, message.encoder_count = 0.01 * number, 1.0, number
+    return message
+
+
+def raw(message: Any) -> bytes:
+    """Serialize as DDS delivers it: in whole words (a string may end in the middle of one)."""
+    data = bytes(serialize_message(message))
+    return data + bytes(-len(data) % 4)
+
+
+def so_far(bag: Path) -> dict[str, list[bytes]]:
+    """Read a bag that is being written; its end may be torn in the middle of a write."""
+    try:
+        return contents(bag)
+    except Exception:  # any error of a reader in a torn file: look again
+        return {}
+
+
+def all_states(found: dict[str, list[bytes]]) -> list[int]:
+    """Count each wheel's messages; the bag also holds log messages of nodes."""
+    return [len(found.get(f"/{wheel}/motor_state", [])) for wheel in WHEELS]
+
+
+def contents(bag: Path) -> dict[str, list[bytes]]:
+    """Read a bag with rosbags."""
+    found: dict[str, list[bytes]] = {}
+    with Reader(bag) as reader:
+        for connection, _, data in reader.messages():
+            found.setdefault(connection.topic, []).append(bytes(data))
+    return found
+
+
+def publish_steadily(publishers, count, rate, make=state):
+    """Publish at a rate; catch up after delays, and skip nothing."""
+    sent = []
+    begin = time.monotonic()
+    for k in range(count):
+        time.sleep(max(0.0, begin + k / rate - time.monotonic()))
+        data = raw(make(k))
+        sent.append(data)
+        for publisher in publishers:
+            publisher.publish(data)  # padding bytes between aligned fields are random
+    return sent
 
 
 @pytest.mark.parametrize("ending", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL])
@@ -288,22 +339,12 @@ def test_play_refuses_invalid_arguments_in_one_line(process, tmp_path, arguments
 
 
 def test_play_reports_types_that_it_skips(process, listener, eventually, tmp_path):
-    bag = tmp_path / "odd.mcap"
-    with bag.open("wb") as file:
-        writer = mcap.writer.Writer(file)
-        writer.start(profile="ros2")
-        for stamp, (topic, kind, data) in enumerate(
-            (
-                ("/odd", "strange_msgs/msg/Thing", bytes(8)),
-                ("/number", "std_msgs/msg/Float64", raw(Float64(data=4.0))),
-                ("/number", "std_msgs/msg/String", raw(String(data="four"))),
-            ),
-            start=1_000,
-        ):
-            schema = writer.register_schema(kind, "ros2msg", b"")
-            channel = writer.register_channel(topic, "cdr", schema)
-            writer.add_message(channel, stamp, data, stamp)
-        writer.finish()
+    sent = [
+        Sent("/odd", "strange_msgs/msg/Thing", 1_000, bytes(8)),
+        Sent("/number", "std_msgs/msg/Float64", 1_001, raw(Float64(data=4.0))),
+        Sent("/number", "std_msgs/msg/String", 1_002, raw(String(data="four"))),
+    ]
+    bag = write_mcap(tmp_path / "odd.mcap", sent, define=lambda _: "")
     player = process("play", bag, *DISCOVERY_DELAY)
     assert player.wait(20.0) == 0
     assert "/odd is not played: its type strange_msgs/msg/Thing is not installed" in player.output

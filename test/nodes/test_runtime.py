@@ -47,18 +47,20 @@ sys.exit(runtime.run("busy", Busy, []))
 
 
 @pytest.fixture
-def context(ros_domain: int) -> Iterator[rclpy.Context]:
+def executor(ros_domain: int) -> Iterator[LeanExecutor]:
     context = rclpy.Context()
     rclpy.init(args=[], context=context, domain_id=ros_domain)
-    yield context
+    executor = LeanExecutor(context=context)
+    yield executor
+    executor.shutdown()
     rclpy.shutdown(context=context)
 
 
 @pytest.fixture
-def executor(context) -> Iterator[LeanExecutor]:
-    executor = LeanExecutor(context=context)
-    yield executor
-    executor.shutdown()
+def node(executor) -> Node:
+    node = rclpy.create_node("tester", context=executor.context)
+    executor.add_node(node)
+    return node
 
 
 def spin_until(executor: LeanExecutor, node: Node, condition, seconds: float = 10.0) -> None:
@@ -70,9 +72,7 @@ def spin_until(executor: LeanExecutor, node: Node, condition, seconds: float = 1
     node.destroy_timer(ticking)
 
 
-def test_lean_executor_serves_topics_timers_services_clients_and_coroutines(context, executor):
-    node = rclpy.create_node("all_kinds", context=context)
-    executor.add_node(node)
+def test_lean_executor_serves_topics_timers_services_clients_and_coroutines(node, executor):
     heard: list[float] = []
     awaited: list[float] = []
 
@@ -95,9 +95,7 @@ def test_lean_executor_serves_topics_timers_services_clients_and_coroutines(cont
     node.destroy_timer(timer)
 
 
-def test_lean_executor_survives_entities_created_and_destroyed_in_callbacks(context, executor):
-    node = rclpy.create_node("coming_and_going", context=context)
-    executor.add_node(node)
+def test_lean_executor_survives_entities_created_and_destroyed_in_callbacks(node, executor):
     publisher = node.create_publisher(String, "y", STREAM_PUBLISHER)
     heard: list[str] = []
     made: list[object] = []
@@ -134,9 +132,7 @@ def waits(monkeypatch) -> Counter[str]:
     return counted
 
 
-def test_waiting_for_a_stream_delays_other_callbacks_only_briefly(context, executor, waits):
-    node = rclpy.create_node("streaming", context=context)
-    executor.add_node(node)
+def test_waiting_for_a_stream_delays_other_callbacks_only_briefly(node, executor, waits):
     node.create_service(Trigger, "ask", lambda _, r: Trigger.Response(success=True))
     client = node.create_client(Trigger, "ask")
     heard: list[float] = []
@@ -169,9 +165,7 @@ def test_waiting_for_a_stream_delays_other_callbacks_only_briefly(context, execu
     call()
 
 
-def test_polled_subscription_does_not_wake_the_executor(context, executor):
-    node = rclpy.create_node("batches", context=context)
-    executor.add_node(node)
+def test_polled_subscription_does_not_wake_the_executor(node, executor):
     kept = node.create_subscription(
         Float64, "batch", lambda _: None, STREAM_SUBSCRIBER, callback_group=PolledSubscriptions()
     )
@@ -189,9 +183,7 @@ def test_polled_subscription_does_not_wake_the_executor(context, executor):
     assert message.data == 7.0
 
 
-def test_an_event_of_a_destroyed_entity_does_not_end_the_spin(context, executor):
-    node = rclpy.create_node("destroying", context=context)
-    executor.add_node(node)
+def test_an_event_of_a_destroyed_entity_does_not_end_the_spin(node, executor):
     reliable = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE)
     named: list[str] = []
     found: dict[str, Subscription] = {}
@@ -225,9 +217,7 @@ def test_an_event_of_a_destroyed_entity_does_not_end_the_spin(context, executor)
     assert named in (["one"], ["two"])
 
 
-def test_exception_in_a_callback_propagates_from_spin(context, executor):
-    node = rclpy.create_node("raising", context=context)
-    executor.add_node(node)
+def test_exception_in_a_callback_propagates_from_spin(node, executor):
     steady_timer(node, 0.01, lambda: [][0])
     with pytest.raises(IndexError):
         spin_until(executor, node, lambda: False, 5.0)
@@ -245,8 +235,7 @@ class Settings:
             raise ParameterError(f"low is {self.low}; it must be below high, {self.high}")
 
 
-def test_settings_change_atomically(context):
-    node = rclpy.create_node("settled", context=context)
+def test_settings_change_atomically(node):
     changes: list[Settings] = []
     parameters = Parameters(node, Settings, changes.append)
     first = parameters.settings
@@ -271,7 +260,6 @@ def test_settings_change_atomically(context):
     assert set_both(low=3, high=4.0) == (True, "")
     assert (parameters.settings.low, parameters.settings.high) == (3.0, 4.0)
     assert changes == [parameters.settings]
-    node.destroy_node()
 
 
 @pytest.mark.parametrize("number", ["SIGINT", "SIGTERM", "SIGQUIT", "SIGHUP", "SIGTSTP"])

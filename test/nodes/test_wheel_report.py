@@ -33,6 +33,11 @@ def make_report(monkeypatch):
     return ask
 
 
+def feed(wheel: WheelController, now: float, velocity: float = 0.0, count: int = 0) -> None:
+    state = SimpleNamespace(voltage=0.0, current=0.0, velocity=velocity, encoder_count=count)
+    wheel.take_feedback(state, round(1e9 * now), round(1e9 * now), now)
+
+
 def test_default_gains_are_reported_in_log_and_diagnostics(make_report):
     log, level, message = make_report(PidGains())
     assert log == [wheel_pid.UNTUNED_TEXT]
@@ -48,15 +53,13 @@ def test_configured_gains_are_not_reported(make_report):
 
 
 def test_feedback_slower_than_time_out_is_reported_with_both_times(make_report):
-    def feed(wheel: WheelController) -> None:
+    def feed_slowly(wheel: WheelController) -> None:
         wheel.activate(100.0)
-        for k in range(1, 5):
-            now = 100.0 + 0.25 * k
+        for now in (100.25, 100.5, 100.75, 101.0):
             wheel.tick(now)
-            state = SimpleNamespace(voltage=0.0, current=0.0, velocity=0.0, encoder_count=0)
-            wheel.take_feedback(state, round(1e9 * now), round(1e9 * now), now)
+            feed(wheel, now)
 
-    _, level, message = make_report(PidGains(p=2.0), feed)
+    _, level, message = make_report(PidGains(p=2.0), feed_slowly)
     assert level == runtime.ERROR
     assert "came 0.25 s after the previous one, and feedback_timeout is 0.2 s" in message
     _, _, message = make_report(
@@ -71,9 +74,7 @@ def test_oscillation_is_reported_with_advice(make_report):
         for k in range(1, 401):
             now = 100.0 + 0.02 * k
             wheel.take_setpoint(1.5, now)
-            speed = 1.5 + 0.9 * math.sin(40.0 * 0.02 * k)
-            state = SimpleNamespace(voltage=0.0, current=0.0, velocity=speed, encoder_count=k)
-            wheel.take_feedback(state, round(1e9 * now), round(1e9 * now), now)
+            feed(wheel, now, 1.5 + 0.9 * math.sin(40.0 * 0.02 * k), k)
 
     _, level, message = make_report(PidGains(p=2.0), swing)
     assert level == runtime.WARN

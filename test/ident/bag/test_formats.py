@@ -203,19 +203,16 @@ def test_types_defined_as_idl_are_understood(tmp_path):
         "module odd_msgs {\n module msg {\n  struct Speed {\n   string label;\n"
         '   sequence<double> values;\n   @unit(value="V")\n   float volts;\n  };\n };\n};\n'
     )
+    line = "=" * 80 + "\nIDL: odd_msgs/msg/Speed\n"
+    sent = [
+        # Label "a", two values, four volts: aligned as CDR asks.
+        Sent("/odd", "odd_msgs/msg/Speed", k * 10_000_000,
+             struct.pack("<4sI2s2xI4xddf", b"\0\1\0\0", 2, b"a\0", 2, 0.5, float(k), 4.0))
+        for k in range(20)
+    ]  # fmt: skip
     path = tmp_path / "bag.mcap"
-    with path.open("wb") as file:
-        writer = mcap.writer.Writer(file)
-        writer.start("ros2")
-        line = "=" * 80 + "\nIDL: odd_msgs/msg/Speed\n"
-        schema = writer.register_schema("odd_msgs/msg/Speed", "ros2idl", (line + text).encode())
-        channel = writer.register_channel("/odd", "cdr", schema)
-        for k in range(20):
-            # Label "a", two values, four volts: aligned as CDR asks.
-            data = struct.pack("<4sI2s2xI4xddf", b"\0\1\0\0", 2, b"a\0", 2, 0.5, float(k), 4.0)
-            writer.add_message(channel, k * 10_000_000, data, 0)
-        writer.finish()
-    record = read_records(path, "voltage=/odd.volts velocity=/odd.values[1]")["motor"]
+    write_mcap(path, sent, define=lambda _: line + text, encoding="ros2idl")
+    record = read_one(path, "voltage=/odd.volts velocity=/odd.values[1]")
     assert record.velocity.tolist() == list(range(20))
     assert set(record.voltage) == {4.0}
 
@@ -272,7 +269,7 @@ def test_summary_equals_that_of_mcap_library(tmp_path, options):
 
 
 def test_damage_to_any_byte_of_the_summary_loses_no_message_silently(tmp_path):
-    path = write_mcap(tmp_path / "bag.mcap", motion(n=60).messages(), defined=False)
+    path = write_mcap(tmp_path / "bag.mcap", motion(n=60).messages(), define=lambda _: "")
     whole = path.read_bytes()
     (begin,) = struct.unpack_from("<Q", whole, len(whole) - 28)  # the footer's summary_start
     for at in range(begin, len(whole)):

@@ -194,20 +194,9 @@ def test_types_given_as_msg_files_are_used(tmp_path):
 
 def test_types_defined_in_the_bag_are_used(tmp_path):
     sent, values = reports(60)
-    store = nested_store()
-    text = store.generate_msgdef("robot_msgs/msg/Report", ros_version=2)[0]
-    path = tmp_path / "bag.mcap"
-    import mcap.writer
-
-    with path.open("wb") as file:
-        writer = mcap.writer.Writer(file, compression=mcap.writer.CompressionType.NONE)
-        writer.start("ros2")
-        schema = writer.register_schema("robot_msgs/msg/Report", "ros2msg", text.encode())
-        channel = writer.register_channel("/report", "cdr", schema)
-        for message in sent:
-            writer.add_message(channel, message.stamp, message.data, message.stamp)
-        writer.finish()
-    record = read_records(path, REPORT_MAP)["motor"]
+    text = nested_store().generate_msgdef("robot_msgs/msg/Report", ros_version=2)[0]
+    path = write_mcap(tmp_path / "bag.mcap", sent, define=lambda _: text)
+    record = read_one(path, REPORT_MAP)
     np.testing.assert_array_equal(record.count, values[:, 1])
     fields = list_topics(path)[0].topics[0].fields
     assert {"wheels[0].speed", "wheels[1].ticks", "flags[2]", "raw[1]"} <= set(fields)
