@@ -291,17 +291,6 @@ def test_a_clock_that_was_set_back_clears_the_window():
     assert len(window) == 1
 
 
-def test_samples_without_voltage_are_left_out():
-    window = filled(1.0)
-    before = len(window)
-    window.add(NOW + 50 * SECOND, state(np.nan, np.nan, 0.0, 0.0, 0))
-    assert len(window) == before
-
-
-def test_rich_excitation_meets_all_requirements():
-    assert find_missing_excitation(filled(10.0).record()) == []
-
-
 @pytest.mark.parametrize(
     ("seconds", "voltage", "word"),
     [

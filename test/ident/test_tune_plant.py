@@ -77,12 +77,6 @@ def test_sampled_motor_with_any_delay_and_window_is_exact(coefficients, delay, w
     assert abs(found - ratio) < 1e-6 * abs(ratio)
 
 
-def test_frequency_response_tends_to_the_static_gain_at_low_frequency():
-    plant = sample(motors(*MOTOR_1), Loop(sample_time=0.001, delay=0.0))
-    # At 1 mrad/s the deviation from the static gain is below 1e-4.
-    assert abs(plant.response(np.array([1e-3]))[0, 0]) == pytest.approx(1 / MOTOR_1[0], rel=1e-4)
-
-
 @pytest.mark.parametrize("window", [0, 1, 4])
 def test_closed_loop_matrix_and_simulation_agree_on_the_decay(window):
     plant = sample(motors(*MOTOR_1), Loop(sample_time=0.005, delay=0.008, difference_window=window))
@@ -223,15 +217,6 @@ def test_a_batch_of_motors_equals_single_motors():
     ]
     # Rounding of the eigenvalue solver, larger for the longer state of the batch.
     np.testing.assert_allclose(batch, single, rtol=1e-6)
-
-
-def test_very_small_inductance_gives_the_first_order_motor():
-    loop = Loop(sample_time=0.01)
-    omega = np.array([1.0, 10.0, 100.0])
-    tiny = sample(motors(0.04, 0.002, 0.002 * 1e-7), loop).response(omega)
-    none = sample(motors(0.04, 0.002, 0.0), loop).response(omega)
-    # An electrical time constant of 0.1 us against 10 ms of sampling.
-    np.testing.assert_allclose(tiny, none, rtol=1e-4)
 
 
 @pytest.mark.parametrize(

@@ -132,13 +132,6 @@ def test_ambiguous_direction_codes_are_refused(tmp_path, still):
     np.testing.assert_allclose(record.voltage[1:], volts[:-1], rtol=1e-12)
 
 
-def test_rim_speed_requires_wheel_radius(tmp_path):
-    mapping = ["voltage=u velocity=y:m/s time=t"]
-    record = read_table(tmp_path, [*mapping, "wheel_radius=0.03"], t=T, u=U, y=0.03 * SPEED)
-    np.testing.assert_allclose(record.velocity, SPEED, atol=1e-12)
-    assert_refused("needs wheel_radius", tmp_path / "log.csv", mapping)
-
-
 def test_pwm_beyond_full_scale_is_clipped_to_supply_voltage(tmp_path):
     rng = np.random.default_rng(5)
     pwm = rng.integers(-255, 256, 400)

@@ -130,12 +130,6 @@ def test_column_names_of_several_words_stay_aligned(tmp_path, head, names):
     assert list_topics(tmp_path / "log.txt")[0].topics[0].fields == names
 
 
-def test_voltage_held_before_its_row_is_read(tmp_path):
-    (tmp_path / "log.csv").write_text(table())
-    record = read_records(tmp_path / "log.csv", [*MAP, "held=before"])["motor"]
-    np.testing.assert_allclose(record.voltage, U)
-
-
 @pytest.mark.parametrize("output", ["velocity", "position", "count"])
 @pytest.mark.parametrize("lead", [False, True])
 def test_hold_of_voltage_is_inferred_from_motion(tmp_path, lead, output):
