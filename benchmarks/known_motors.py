@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Recordings of known motors for the benchmarks of identification.
 
-The simulator (test/ident/independent.py) integrates in small fixed steps and shares nothing
+The simulator (test/ident/motors.py) integrates in small fixed steps and shares nothing
 with the estimator.
 """
 
@@ -15,7 +15,7 @@ import numpy as np
 ROOT = Path(__file__).resolve().parents[1]
 sys.path[:0] = [str(ROOT), str(ROOT / "test"), str(ROOT / "test" / "ident")]
 
-import independent  # noqa: E402
+import motors as independent  # noqa: E402
 
 from smp_motor_control.motor.parameters import COMBINATIONS, PHYSICAL, MotorParameters  # noqa: E402
 from smp_motor_ident.record import Hardware, Record  # noqa: E402

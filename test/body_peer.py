@@ -3,13 +3,13 @@
 
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
-from domain_node import DomainNode
 from geometry_msgs.msg import Twist, TwistStamped
 from nav_msgs.msg import Odometry
 from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
 from rcl_interfaces.srv import SetParameters
 from rclpy.time import Time
 from sensor_msgs.msg import Imu, JointState
+from wheel_robot import DomainNode
 
 from smp_interfaces.msg import MotorState
 

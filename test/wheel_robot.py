@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Peer of nodes in tests: it sends set-points and feedback, and stores the messages."""
+"""Nodes of tests in their own ROS domain, and the peer that drives and stores the wheels."""
 
 import copy
 import math
@@ -9,14 +9,15 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import rclpy
 import yaml
 from diagnostic_msgs.msg import DiagnosticArray
-from domain_node import DomainNode
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState
 from rcl_interfaces.srv import SetParametersAtomically
+from rclpy.executors import SingleThreadedExecutor
 from rclpy.parameter import Parameter
-from rclpy.qos import QoSProfile, ReliabilityPolicy
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64
 from std_srvs.srv import Trigger
@@ -41,6 +42,37 @@ def two_wheeled(folder: Path) -> tuple[Path, Path]:
     files[0].write_text(yaml.safe_dump({"/**/motor_plant": document}))
     files[1].write_text(yaml.safe_dump(tree))
     return files
+
+
+class DomainNode:
+    """Node, context and executor, made and ended together."""
+
+    def __init__(self, domain: int, name: str) -> None:
+        self.context = rclpy.Context()
+        rclpy.init(args=[], context=self.context, domain_id=domain)
+        self.node = rclpy.create_node(name, context=self.context)
+        self.executor = SingleThreadedExecutor(context=self.context)
+        self.executor.add_node(self.node)
+
+    def spin(self) -> None:
+        self.executor.spin_once(timeout_sec=0.005)
+
+    def hear(self, topic: str, kind: type) -> list[Any]:
+        """Return the messages of a topic, those sent earlier and kept for late readers first."""
+        heard: list[Any] = []
+        latched = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+        self.node.create_subscription(kind, topic, heard.append, latched)
+        return heard
+
+    def spin_for(self, seconds: float) -> None:
+        end = time.monotonic() + seconds
+        while time.monotonic() < end:
+            self.spin()
+
+    def close(self) -> None:
+        self.executor.shutdown()
+        self.node.destroy_node()
+        rclpy.shutdown(context=self.context)
 
 
 class Relay:

@@ -5,11 +5,10 @@ import json
 from dataclasses import replace
 from functools import cache, partial
 
-import independent
 import motors
 import numpy as np
 import pytest
-from independent import excitation, simulate
+from motors import excitation, simulate
 
 from smp_motor_control.motor.parameters import PHYSICAL
 from smp_motor_ident.errors import ParameterError
@@ -229,7 +228,7 @@ def test_load_larger_than_friction_is_estimated():
     up = np.linspace(0.0, 3.0, 7)
     steps = np.concatenate([up, up[-2::-1], -up[1:], -up[-2::-1]])
     volts = np.resize(np.repeat(steps, 65), t.size)
-    motion = independent.simulate(t, volts, R, L, K, J, B, TC, np.full(t.size, load), 40)
+    motion = simulate(t, volts, R, L, K, J, B, TC, np.full(t.size, load), 40)
     count = np.floor(motion[:, 2] * 2000 / (2 * np.pi) + 0.637).astype(np.int64)
     found = estimate(Record("motor", t, volts, count=count, hardware=Hardware(1.0, 2000.0)))
     truth = {

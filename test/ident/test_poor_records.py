@@ -6,7 +6,7 @@ from dataclasses import replace
 import motors
 import numpy as np
 import pytest
-from independent import simulate
+from motors import simulate
 from scipy.signal import lfilter
 
 from smp_motor_ident.errors import InsufficientExcitationError, SignalError
@@ -269,7 +269,7 @@ def test_validation_accounts_for_the_sensor_resolution(share):
     if share == 1.0:  # a tail of a few counts is predicted to a count
         found = estimate(make_weakened_record(CHIRP, 1.0, RATE))
     else:
-        volts = motors.independent.excitation(np.arange(2000) / 200.0, "square", 10.0)
+        volts = motors.excitation(np.arange(2000) / 200.0, "square", 10.0)
         found = estimate(make_weakened_record(volts, share, 200.0))
     codes = {f.code: f.severity for f in found.findings}
     assert ("validation" in codes or "supply_drift" in codes) == (share < 1.0)

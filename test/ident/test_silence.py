@@ -48,7 +48,7 @@ def test_disconnected_encoder_is_refused_as_dead(signal, kind):
     if kind == "chirp":
         whole, shares = make_coarse_record(signal), [0.1]
     else:
-        volts = motors.independent.excitation(np.arange(2000) / 200.0, kind, 10.0)
+        volts = motors.excitation(np.arange(2000) / 200.0, kind, 10.0)
         whole, shares = make_coarse_record(signal, volts, 200.0), [0.2, 0.5, 0.85]
         refuse_silent_sensor(whole, "record")
     for share in shares:
@@ -76,7 +76,7 @@ def test_a_motor_stopped_by_friction_in_a_fast_chirp_is_not_a_dead_encoder(wheel
 
 
 def test_a_standstill_at_the_end_of_a_run_does_not_affect_the_next():
-    volts = motors.independent.excitation(np.arange(2000) / 200.0, "sine", 10.0)
+    volts = motors.excitation(np.arange(2000) / 200.0, "sine", 10.0)
     whole = make_coarse_record("count", volts, 200.0)
     stands = (np.arange(2000) >= 850) & (np.arange(2000) < 1150)
     kept = np.where(stands, whole.count[850], whole.count).astype(np.int64)
@@ -90,7 +90,7 @@ def test_a_standstill_at_the_end_of_a_run_does_not_affect_the_next():
 @pytest.mark.parametrize("span", [(800, 1200), (500, 1400)])
 def test_temporarily_blocked_motor_is_estimated_from_the_other_samples(span):
     """Blocked for a fifth and for nearly half of the record."""
-    volts = motors.independent.excitation(np.arange(2000) / 200.0, "fourier", 10.0)
+    volts = motors.excitation(np.arange(2000) / 200.0, "fourier", 10.0)
     whole = motors.record("rear_left", current=False, voltage=volts, rate=200.0)
     whole = replace(whole, velocity=None)
     a, b = span

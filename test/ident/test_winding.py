@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from independent import simulate
+from motors import simulate
 
 from smp_motor_ident.commission.winding import report_heated_winding, resistance
 from smp_motor_ident.record import Record

@@ -5,8 +5,8 @@ from collections.abc import Iterator
 
 import pytest
 from body_peer import GEOMETRY, Peer
-from domain_node import DomainNode
 from rclpy.node import Node
+from wheel_robot import DomainNode
 
 
 @pytest.fixture

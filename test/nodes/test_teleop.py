@@ -15,9 +15,9 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from domain_node import DomainNode
 from geometry_msgs.msg import TwistStamped
 from sensor_msgs.msg import JointState
+from wheel_robot import DomainNode
 
 LFLAG = 3
 

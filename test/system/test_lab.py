@@ -16,8 +16,7 @@ import pytest
 import yaml
 from browser import AXE, Clicks, violations
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
-from domain_node import DomainNode
-from wheel_robot import two_wheeled
+from wheel_robot import DomainNode, two_wheeled
 
 from smp_interfaces.msg import MotorState
 from smp_motor_control import WHEELS

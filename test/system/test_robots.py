@@ -7,10 +7,9 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from domain_node import DomainNode
 from geometry_msgs.msg import TwistStamped
 from nav_msgs.msg import Odometry
-from wheel_robot import two_wheeled
+from wheel_robot import DomainNode, two_wheeled
 
 from smp_motor_control import WHEELS
 from smp_motor_control.errors import ParameterError

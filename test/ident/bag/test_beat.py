@@ -3,7 +3,7 @@
 
 import numpy as np
 import pytest
-from independent import simulate
+from motors import simulate
 from recordings import START, codes, floats, in_order, read, read_table
 
 from smp_motor_ident.estimate import estimate

@@ -1,16 +1,19 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The pages on the estimator against the code: functions, effects, quantities and output."""
+"""Pages that follow the code: functions, effects, quantities and output, and all messages."""
 
 import ast
 import re
+import subprocess
+import sys
 from pathlib import Path
 
+import pytest
 from printed import agree
 
 from smp_motor_ident.chain.catalogue import ALL
 from smp_motor_ident.result import UNITS
 
-ROOT = Path(__file__).resolve().parents[2]
+ROOT = Path(__file__).resolve().parents[1]
 PLAIN = {"first_order", "second_order", "electromechanical", "friction", "speed", "angle",
          "current"}  # fmt: skip
 
@@ -85,3 +88,29 @@ def test_example_program_prints_the_documented_output(capsys):
     exec(compile(program, "identification", "exec"), {})
     fresh = capsys.readouterr().out.splitlines()
     assert [a for a, b in zip(shown, fresh, strict=True) if not agree(a, b)] == []
+
+
+PAGE = (ROOT / "docs" / "messages.md").read_text()
+MESSAGES = re.findall("^- (.*)", PAGE, re.MULTILINE)
+
+FAULTS = {
+    "longer than 260 characters": r".{261}",
+    "more than two sentences": r"[.?] [A-Z].*[.?] [A-Z]",
+    # In words: "resistance", "DC gain"; names to type, such as parameters, keep their underscores.
+    "a quantity in code": r"(?<!\.)\b(dc_gain|time_constant|static_voltage|\w+_friction)\b",
+    "a number without unit": r"\b(at|about|for|in|every|within|reaches) N(?! [A-Za-z%…])",
+    "a percent sign without a space": r"[N\d]%",
+    "an obscure phrase": r"\b(what (is|the|it)|of which|beside|is none|are no|(?<!there )is no)\b",
+}  # fmt: skip
+
+
+def test_messages_page_matches_the_code():
+    script = [sys.executable, ROOT / "scripts" / "messages.py"]
+    made = subprocess.run(script, capture_output=True, text=True, check=True).stdout
+    assert made == PAGE, "python scripts/messages.py > docs/messages.md"
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_no_message_has_style_fault(fault):
+    assert len(MESSAGES) > 400
+    assert [one for one in MESSAGES if re.search(FAULTS[fault], one)] == []
