@@ -188,27 +188,20 @@ def test_records_without_a_signal_in_common_are_refused():
         estimate([counts, speed])
 
 
-def test_invalid_model_or_fixed_parameter_is_refused_by_name():
-    recording = motors.record(seconds=1.0)
-    with pytest.raises(ParameterError, match="third_order"):
-        estimate(recording, model="third_order")
-    with pytest.raises(ParameterError, match="mass"):
-        estimate(recording, fixed={"mass": 1.0})
-    with pytest.raises(ParameterError, match="resistance = -1"):
-        estimate(recording, fixed={"resistance": -1.0})
-
-
 @pytest.mark.parametrize(
-    ("bounds", "current"),
+    ("asked", "words", "current"),
     [
-        ({"inductance": (1e-4, 1e-2)}, False),
-        ({"stiffness": (0.0, 1.0)}, True),
-        ({"inertia": (2.0, 1.0)}, True),
+        ({"model": "third_order"}, "third_order", True),
+        ({"fixed": {"mass": 1.0}}, "mass", True),
+        ({"fixed": {"resistance": -1.0}}, "resistance = -1", True),
+        ({"bounds": {"inductance": (1e-4, 1e-2)}}, "inductance", False),
+        ({"bounds": {"stiffness": (0.0, 1.0)}}, "stiffness", True),
+        ({"bounds": {"inertia": (2.0, 1.0)}}, "inertia", True),
     ],
 )
-def test_invalid_bounds_are_refused_by_name(bounds, current):
-    with pytest.raises(ParameterError, match=next(iter(bounds))):
-        estimate(motors.record("rear_left", current=current), bounds=bounds)
+def test_invalid_model_parameter_or_bounds_are_refused_by_name(asked, words, current):
+    with pytest.raises(ParameterError, match=words):
+        estimate(motors.record("rear_left", current=current), **asked)
 
 
 @pytest.mark.parametrize("seed", [0, 3])

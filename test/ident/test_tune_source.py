@@ -119,15 +119,14 @@ def test_at_1_khz_the_observer_is_chosen_with_its_reason(estimates):
     assert better.performance.control_noise <= 1.01 * 0.48
 
 
-def test_at_200_hz_the_reported_speed_is_chosen(estimates):
-    loop, _ = choose_source(estimates["rear_left"], Loop(sample_time=0.005))
-    assert loop.speed_source == "measured"
-
-
-def test_measured_speed_is_chosen_without_counts(estimates):
-    loop, why = choose_source(estimates["rear_left"], Loop(counts_per_revolution=None))
-    assert loop.speed_source == "measured"
-    assert "not known" in why
+@pytest.mark.parametrize(
+    ("loop", "words"),
+    [(Loop(sample_time=0.005), ""), (Loop(counts_per_revolution=None), "not known")],
+    ids=["200 Hz", "without counts"],
+)
+def test_reported_speed_is_chosen_at_a_low_rate_or_without_counts(estimates, loop, words):
+    chosen, why = choose_source(estimates["rear_left"], loop)
+    assert chosen.speed_source == "measured" and words in why
 
 
 def test_source_is_chosen_with_given_counts_after_identification_from_speed(estimates):

@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from recordings import (
     START,
     Motion,
+    Sent,
     assert_read,
     floats,
     in_order,
@@ -17,9 +18,9 @@ from recordings import (
     motion,
     notes,
     read,
+    read_one,
     write_bag,
-    write_mcap,
-    write_sqlite,
+    write_file,
 )
 
 from smp_motor_ident.bag import join_records, read_records
@@ -62,9 +63,7 @@ def test_shuffled_samples_are_sorted_and_reported(tmp_path_factory, order, stora
     messages = truth.messages(description=False)
     description = truth.messages()[:1]
     path = tmp_path_factory.mktemp("bag") / f"bag.{storage}"
-    write = write_mcap if storage == "mcap" else write_sqlite
-    write(path, [*description, *(messages[k] for k in order)])
-    record = read_records(path)["front_left"]
+    record = read_one(write_file(path, [*description, *(messages[k] for k in order)]))
     assert_read(record, truth)
     shuffled = list(order) != sorted(order)
     assert ("out of order" in notes(record)) is shuffled
@@ -148,27 +147,24 @@ def test_header_stamps_days_off_the_log_times_are_used_and_reported(tmp_path, da
     assert (f"{days * 86400:+d}.000000 s from the header's" in notes(record)) is bool(days)
 
 
+def stamp_headers(truth: Motion, stamps: np.ndarray) -> list[Sent]:
+    """Return the messages of a motion with other header stamps, logged at its times."""
+    messages = replace(truth, time=stamps).messages(description=False)
+    logged = [replace(sent, stamp=int(at)) for sent, at in zip(messages, truth.time)]
+    return [*truth.messages()[:1], *logged]
+
+
 def test_log_times_are_used_when_header_stamps_are_not_set(tmp_path):
     truth = motion(n=100)
-    unset = replace(truth, time=np.zeros(100, np.int64))
-    messages = [
-        replace(sent, stamp=int(truth.time[k]))
-        for k, sent in enumerate(unset.messages(description=False))
-    ]
-    record = read(tmp_path / "bag.mcap", [*truth.messages()[:1], *messages])
+    record = read(tmp_path / "bag.mcap", stamp_headers(truth, np.zeros(100, np.int64)))
     assert_read(record, truth)
     assert "time: log times (the header stamps are not set)" in notes(record)
 
 
 def test_clock_set_back_begins_a_segment(tmp_path):
     truth = motion(n=200)
-    stamps = truth.time.copy()
-    stamps[100:] -= 3_600 * 10**9
-    messages = [
-        replace(sent, stamp=int(truth.time[k]))
-        for k, sent in enumerate(replace(truth, time=stamps).messages(description=False))
-    ]
-    record = read(tmp_path / "bag.mcap", [*truth.messages()[:1], *messages])
+    stamps = truth.time - 3_600 * 10**9 * (np.arange(200) >= 100)
+    record = read(tmp_path / "bag.mcap", stamp_headers(truth, stamps))
     assert record.starts == (0, 100)
     np.testing.assert_array_equal(record.voltage, truth.voltage)
     assert "set back 1 times" in notes(record)
@@ -296,12 +292,11 @@ def test_signal_missing_in_one_recording_is_nan_after_joining(tmp_path):
 
 def test_recording_date_is_given_only_if_clock_was_set(tmp_path):
     truth = motion()
-    (record,) = read_records(write_mcap(tmp_path / "a.mcap", truth.messages())).values()
+    record = read(tmp_path / "a.mcap", truth.messages())
     assert record.recorded == pytest.approx(1e-9 * START, abs=1.0)
     # A computer without a clock battery starts at 1970, which is not a date.
     early = replace(truth, time=truth.time - START)
-    (record,) = read_records(write_mcap(tmp_path / "b.mcap", early.messages())).values()
-    assert record.recorded is None
+    assert read(tmp_path / "b.mcap", early.messages()).recorded is None
 
 
 @pytest.mark.parametrize("years", [0.01, 1.0, 56.0])
