@@ -133,10 +133,8 @@ def write_table(path: Path, separator: str = ",", **columns: Iterable[Any]) -> P
 
 def follow(voltage):
     """Return the speed of a motor, 20 rad/s/V and 0.1 s, under voltages held for 10 ms each."""
-    speed = np.zeros(len(voltage))
-    for k in range(1, speed.size):
-        speed[k] = speed[k - 1] + (1 - np.exp(-0.1)) * (20 * voltage[k - 1] - speed[k - 1])
-    return speed
+    keep = np.exp(-0.1)
+    return lfilter([0.0, 20 * (1 - keep)], [1.0, -keep], voltage)
 
 
 def write_steps(path: Path, seconds=20.0, level=6.0, seed=1, begin=0.0) -> Path:

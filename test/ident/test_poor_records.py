@@ -321,10 +321,7 @@ def test_a_motor_at_rest_with_a_noisy_angle_is_refused_despite_its_current():
     resistance, inductance, step = 4.0, 0.02, 0.01
     rng = np.random.default_rng(3)
     voltage = np.repeat(rng.choice([-0.1, 0.0, 0.1], 40), 15)
-    decay = np.exp(-step * resistance / inductance)
-    current = np.zeros(voltage.size)
-    for k in range(1, voltage.size):  # held over the interval before
-        current[k] = decay * current[k - 1] + (1 - decay) * voltage[k] / resistance
+    current = motors.first_order(voltage, 1 / resistance, inductance / resistance, step)
     position = 1e-3 * rng.standard_normal(voltage.size)
     noisy = current + 1e-4 * rng.standard_normal(voltage.size)
     record = Record("w", step * np.arange(voltage.size), voltage, noisy, position=position)

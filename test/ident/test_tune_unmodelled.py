@@ -7,6 +7,7 @@ import control
 import drives
 import numpy as np
 import pytest
+from scipy.signal import cont2discrete, lfilter
 
 from smp_motor_ident.errors import DesignError
 from smp_motor_ident.result import Estimate, ModelError, ResidualTests
@@ -149,16 +150,11 @@ def test_the_gains_file_states_the_tolerated_model_error():
     assert "pseudo-random" in found["advice"]
 
 
-def simulate_resonance(reference, omega, T, damping=0.0):
-    """Return the response of a resonance to a reference, by semi-implicit Euler."""
-    y = rate = 0.0
-    out, sub = [], 200
-    for r in reference:
-        for _ in range(sub):
-            rate += T / sub * (omega**2 * (r - y) - 2 * damping * omega * rate)
-            y += T / sub * rate
-        out.append(y)
-    return np.array(out)
+def simulate_resonance(reference, omega, T, damping):
+    """Return the response of a resonance at the end of each sample of a held reference."""
+    resonance = [omega**2], [1.0, 2 * damping * omega, omega**2]
+    b, a, _ = cont2discrete(resonance, T)
+    return lfilter(b.ravel()[1:], a, reference)
 
 
 def minimum_jerk(T, duration, samples):

@@ -5,6 +5,7 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
+from scipy.signal import cont2discrete, lfilter
 
 from smp_motor_ident.estimate import estimate
 from smp_motor_ident.infer.unmodelled import compute_relative_error
@@ -131,19 +132,14 @@ def test_friction_kinks_under_ramps_do_not_count_as_excitation():
 
 def record(seed: int, resonance: float | None) -> Record:
     """Return a motor of 20 rad/s/V and 50 ms, optionally with a resonance, under held voltage."""
-    rng, T, n, sub = np.random.default_rng(seed), 0.005, 6000, 20
+    rng, T, n = np.random.default_rng(seed), 0.005, 6000
     u = 6.0 * np.sign(rng.standard_normal(n // 6)).repeat(6)
-    h, y, w, rate, shown = T / sub, 0.0, 0.0, 0.0, []
-    for k in range(n):
-        for _ in range(sub):
-            w += h * (20.0 * u[k] - w) / 0.05
-            if resonance is None:
-                y = w
-            else:  # semi-implicit Euler keeps a lightly damped oscillation as it is
-                rate += h * (resonance**2 * (w - y) - 0.1 * resonance * rate)
-                y += h * rate
-        shown.append(y)
-    speed = np.concatenate([[0.0], shown]) + 0.3 * rng.standard_normal(n + 1)
+    num, den = [20.0], [0.05, 1.0]
+    if resonance is not None:
+        num = [20.0 * resonance**2]
+        den = np.polymul(den, [1.0, 0.1 * resonance, resonance**2])
+    b, a, _ = cont2discrete((num, den), T)
+    speed = lfilter(b.ravel(), a, np.append(u, 0.0)) + 0.3 * rng.standard_normal(n + 1)
     voltage = np.concatenate([[0.0], u])
     return Record("motor", np.arange(n + 1) * T, voltage, velocity=speed, source="made")
 

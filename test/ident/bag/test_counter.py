@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from recordings import COUNTS, RATIO, assert_refused, motion, notes, read, read_table, write_table
+from scipy.signal import lfilter
 
 from smp_motor_ident.bag.counter import Wrap, find_full_count, round_to_counts, unwrap, unwrap_angle
 from smp_motor_ident.errors import BagError
@@ -288,10 +289,7 @@ def simulate_angle(samples: int, most: float, seed: int) -> np.ndarray:
     """Return the angle of a motor that turns both ways and changes speed within 50 samples."""
     rng = np.random.default_rng(seed)
     aims = np.repeat(rng.uniform(-most, most, samples // 100 + 1), 100)[:samples]
-    speed = np.zeros(samples)
-    for k in range(1, samples):
-        speed[k] = speed[k - 1] + 0.05 * (aims[k] - speed[k - 1])
-    return np.cumsum(speed)
+    return np.cumsum(lfilter([0.05], [1.0, -0.95], aims))
 
 
 @pytest.mark.parametrize("width", [360, 400, 1000, 1440, 2400, 3000])
@@ -378,9 +376,7 @@ def simulate_wrapped_angle(top: float, lag: float, drive: str) -> np.ndarray:
     k = np.arange(2000)
     levels = np.repeat(np.random.default_rng(5).uniform(-1, 1, 50), 40)
     target = {"levels": levels, "sine": np.sin(k / 30), "step": np.where(k < 200, 0.0, 1.0)}[drive]
-    speed = np.zeros(k.size)
-    for n in range(1, k.size):
-        speed[n] = speed[n - 1] + (np.pi * top * target[n] - speed[n - 1]) / lag
+    speed = lfilter([np.pi * top / lag], [1.0, 1 / lag - 1.0], target)
     return np.mod(np.cumsum(speed), 2 * np.pi)
 
 
