@@ -5,8 +5,6 @@ import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import Twist, TwistStamped
 from nav_msgs.msg import Odometry
-from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
-from rcl_interfaces.srv import SetParameters
 from rclpy.time import Time
 from sensor_msgs.msg import Imu, JointState
 from wheel_robot import DomainNode
@@ -92,17 +90,6 @@ class Peer(DomainNode):
 
     def diagnosis(self, text: str) -> bool:
         return any(s.name == "skid_steer" and text in s.message for s in self.diagnostics)
-
-    def set(self, name: str, value: float) -> tuple[bool, str]:
-        client = self.node.create_client(SetParameters, "/skid_steer/set_parameters")
-        assert client.wait_for_service(5.0)
-        parameter = Parameter(
-            name=name, value=ParameterValue(type=ParameterType.PARAMETER_DOUBLE, double_value=value)
-        )
-        future = client.call_async(SetParameters.Request(parameters=[parameter]))
-        self.executor.spin_until_future_complete(future, 5.0)
-        result = future.result().results[0]
-        return result.successful, result.reason
 
 
 def repeatedly(peer: Peer, send, condition, eventually, deadline: float = 5.0) -> None:

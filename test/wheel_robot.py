@@ -53,6 +53,7 @@ class DomainNode:
         self.node = rclpy.create_node(name, context=self.context)
         self.executor = SingleThreadedExecutor(context=self.context)
         self.executor.add_node(self.node)
+        self._clients: dict[str, Any] = {}
 
     def spin(self) -> None:
         self.executor.spin_once(timeout_sec=0.005)
@@ -68,6 +69,31 @@ class DomainNode:
         end = time.monotonic() + seconds
         while time.monotonic() < end:
             self.spin()
+
+    def set(self, node: str, **values: object) -> tuple[bool, str]:
+        """Set parameters atomically; names have __ for a dot."""
+        parameters = [
+            Parameter(name.replace("__", "."), value=value).to_parameter_msg()
+            for name, value in values.items()
+        ]
+        request = SetParametersAtomically.Request(parameters=parameters)
+        name = f"/{node}/set_parameters_atomically"
+        result = self._call(SetParametersAtomically, name, request).result
+        return result.successful, result.reason
+
+    def _call(self, kind: object, name: str, request: object) -> object:
+        # Clients are stored, as each new one must be discovered again.
+        if name not in self._clients:
+            self._clients[name] = self.node.create_client(kind, name)
+        client = self._clients[name]
+        assert client.wait_for_service(10.0)
+        future = client.call_async(request)
+        end = time.monotonic() + 10.0
+        while not future.done() and time.monotonic() < end:
+            self.spin()
+        if not future.done():
+            pytest.fail(f"{name} does not answer")
+        return future.result()
 
     def close(self) -> None:
         self.executor.shutdown()
@@ -152,7 +178,6 @@ class WheelRobot(DomainNode):
         self.diagnoses: list[tuple[float, str, bytes, str]] = []
         self.setpoint: float | None = None
         self._sent = 0.0
-        self._clients: dict[str, Any] = {}
         node = self.node
         for wheel in WHEELS:
             kept = self.states[wheel].append
@@ -209,17 +234,6 @@ class WheelRobot(DomainNode):
     def last_diagnosis(self, node: str) -> str:
         return next((m for _, n, _, m in reversed(self.diagnoses) if n == node), "")
 
-    def set(self, node: str, **values: object) -> tuple[bool, str]:
-        """Set parameters atomically; names have __ for a dot."""
-        parameters = [
-            Parameter(name.replace("__", "."), value=value).to_parameter_msg()
-            for name, value in values.items()
-        ]
-        request = SetParametersAtomically.Request(parameters=parameters)
-        name = f"/{node}/set_parameters_atomically"
-        result = self._call(SetParametersAtomically, name, request).result
-        return result.successful, result.reason
-
     def transition(self, node: str, name: str) -> bool:
         number = getattr(Transition, f"TRANSITION_{name.upper()}")
         request = ChangeState.Request(transition=Transition(id=number))
@@ -228,17 +242,3 @@ class WheelRobot(DomainNode):
     def trigger(self, node: str, service: str) -> str:
         """Call a ``std_srvs/Trigger`` of a node; return its message."""
         return str(self._call(Trigger, f"/{node}/{service}", Trigger.Request()).message)
-
-    def _call(self, kind: object, name: str, request: object) -> object:
-        # Clients are stored, as each new one must be discovered again.
-        if name not in self._clients:
-            self._clients[name] = self.node.create_client(kind, name)
-        client = self._clients[name]
-        assert client.wait_for_service(10.0)
-        future = client.call_async(request)
-        end = time.monotonic() + 10.0
-        while not future.done() and time.monotonic() < end:
-            self.spin()
-        if not future.done():
-            pytest.fail(f"{name} does not answer")
-        return future.result()

@@ -3,7 +3,6 @@
 
 import math
 import random
-from collections.abc import Callable
 from dataclasses import dataclass, fields
 
 import numpy as np
@@ -44,29 +43,6 @@ class Run:
     count: NDArray[np.int64]
 
 
-class _Tape:
-    """Rows of a run while it is being made."""
-
-    def __init__(self) -> None:
-        self._rows: list[tuple[float, ...]] = []
-
-    def write(
-        self, time: float, loop: tuple[float, float, float], plant: DrivenMotor, sample: Sample,
-        command: float,
-    ) -> None:  # fmt: skip
-        gearbox, motor = plant.entry.gearbox, plant.motor
-        truth = (gearbox.to_wheel(motor.speed), gearbox.to_wheel(motor.angle))
-        self._rows.append(
-            (time, *loop, *truth, sample.voltage, command, sample.current, sample.encoder_count)
-        )
-
-    def run(self) -> Run:
-        columns = np.array(self._rows, dtype=np.float64).T
-        named = dict(zip((f.name for f in fields(Run)), columns))
-        counts = named.pop("count").astype(np.int64)
-        return Run(count=counts, **named)
-
-
 def _instants(duration: float, timing: Timing, seed: int) -> list[float]:
     draw = random.Random(seed)
     shortest = 0.1 * timing.sample_time
@@ -78,10 +54,6 @@ def _instants(duration: float, timing: Timing, seed: int) -> list[float]:
         time = time + step if timing.jitter > 0 else len(instants) * timing.sample_time
         instants.append(time)
     return instants
-
-
-Answer = Callable[[float, float, Sample], tuple[float, tuple[float, float, float]]]
-"""From time, interval and sample to the command, and set-point, reference and measurement."""
 
 
 def simulate_open_loop(entry, voltage, duration, **world):
@@ -112,14 +84,17 @@ def _simulate(entry, answer, duration, *, timing=None, drive=None, load=None, su
     timing = timing or Timing()
     drive = drive or DriveSettings(command_timeout=math.inf)
     plant = DrivenMotor(entry, drive, supply, seed=seed)
-    tape = _Tape()
-    before = 0.0
+    rows, before = [], 0.0
     for time in _instants(duration, timing, seed):
         sample = plant.sample(time)
         command, row = answer(time, time - before, sample)
         before = time
-        tape.write(time, row, plant, sample, command)
+        truth = map(entry.gearbox.to_wheel, (plant.motor.speed, plant.motor.angle))
+        rows.append(
+            (time, *row, *truth, sample.voltage, command, sample.current, sample.encoder_count)
+        )
         if load is not None:
             plant.load(time, load(time))
         plant.command(time + timing.delay, command)
-    return tape.run()
+    named = dict(zip((f.name for f in fields(Run)), np.array(rows, dtype=np.float64).T))
+    return Run(**named | {"count": named["count"].astype(np.int64)})

@@ -148,7 +148,7 @@ def test_body_stops_within_stop_time_for_any_limits(skid_steer, peer, eventually
     repeatedly(peer, lambda: peer.command(0.5), lambda: peer.drives(5.0, 5.0), eventually)
     name, value = limit.split(":=")
     peer.command(0.5)
-    assert peer.set(name, float(value)) == (True, "")
+    assert peer.set("skid_steer", **{name: float(value)}) == (True, "")
     peer.setpoints.clear()
     asked = peer.node.get_clock().now().nanoseconds * 1e-9
     repeatedly(peer, lambda: peer.command(0.0), lambda: peer.drives(0.0, 0.0), eventually)
@@ -175,17 +175,17 @@ def test_parameters_change_while_driving_and_invalid_ones_are_refused(skid_steer
         "linear.x.max_acceleration": -1.0,
     }
     for name, value in nonsense.items():
-        successful, said = peer.set(name, value)
+        successful, said = peer.set("skid_steer", **{name: value})
         assert not successful
         assert name.removesuffix(".max_acceleration").removeprefix("heading_") in said
     peer.setpoints.clear()
     repeatedly(peer, lambda: peer.command(0.5), lambda: peer.drives(5.0, 5.0), eventually)
-    assert peer.set("linear.x.max_velocity", 0.4)[0]
+    assert peer.set("skid_steer", linear__x__max_velocity=0.4)[0]
     repeatedly(peer, lambda: peer.command(1.0), lambda: peer.drives(4.0, 4.0), eventually)
-    assert peer.set("linear.x.max_velocity", math.nan)[0]
-    assert peer.set("linear.x.max_acceleration", math.nan)[0]
+    assert peer.set("skid_steer", linear__x__max_velocity=math.nan)[0]
+    assert peer.set("skid_steer", linear__x__max_acceleration=math.nan)[0]
     # 1 m/s and 2 rad/s ask for 6 and 14 rad/s: both shrink by 3/14 and the path keeps its shape.
-    assert peer.set("max_wheel_velocity", 3.0)[0]
+    assert peer.set("skid_steer", max_wheel_velocity=3.0)[0]
     repeatedly(
         peer, lambda: peer.command(1.0, 2.0), lambda: peer.drives(6.0 * 3.0 / 14.0, 3.0), eventually
     )
