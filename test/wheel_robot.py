@@ -1,10 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """Nodes of tests in their own ROS domain, and the peer that drives and stores the wheels."""
 
+import contextlib
 import copy
 import math
+import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -99,6 +101,22 @@ class DomainNode:
         self.executor.shutdown()
         self.node.destroy_node()
         rclpy.shutdown(context=self.context)
+
+
+@contextlib.contextmanager
+def spinning(spin: Callable[[], object]) -> Iterator[None]:
+    """Call ``spin`` over and over in a thread."""
+    ended = threading.Event()
+
+    def run() -> None:
+        while not ended.is_set():
+            spin()
+
+    thread = threading.Thread(target=run, daemon=True)
+    thread.start()
+    yield
+    ended.set()
+    thread.join()
 
 
 class Relay:

@@ -122,6 +122,12 @@ def first_order(voltage, gain, tau, step):
     return np.r_[0.0, lfilter([1 - keep], [1.0, -keep], gain * voltage[1:])]
 
 
+def counted(t, voltage, angle, per_turn=500.0, current=None) -> Record:
+    """Return the record of a motor whose angle is counted."""
+    count = np.floor(angle * per_turn / (2 * np.pi)).astype(np.int64)
+    return Record("motor", t, voltage, current, count=count, hardware=Hardware(1.0, per_turn))
+
+
 def record(
     wheel="rear_left",
     *,

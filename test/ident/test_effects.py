@@ -10,7 +10,7 @@ from motors import TABLE_1, excitation, simulate
 from scipy.signal import lsim
 
 from smp_motor_ident.estimate import estimate
-from smp_motor_ident.record import Hardware, Record
+from smp_motor_ident.record import Record
 
 LEAST = 1.5
 """Command below which a driver puts out nothing [V]."""
@@ -42,10 +42,7 @@ def test_clean_sine_of_whole_rows_gets_no_effect(resistance, electrical):
     x = simulate(t, voltage, resistance, resistance * electrical, k, 3.85e-7, 6e-7, friction,
                  np.zeros(t.size), 2000)  # fmt: skip
     current = x[:, 0] + 0.002 * np.random.default_rng(1).standard_normal(t.size)
-    count = np.floor(x[:, 2] * 500 / (2 * np.pi)).astype(np.int64)
-    found = estimate(
-        Record("motor", t, voltage, current, count=count, hardware=Hardware(1.0, 500.0))
-    )
+    found = estimate(motors.counted(t, voltage, x[:, 2], current=current))
     assert set(found.chain.components) == {"friction", "angle", "electromechanical", "current"}
     assert "misfit" not in [f.code for f in found.findings]
 
@@ -57,8 +54,8 @@ def test_once_per_turn_encoder_error_is_estimated(error):
     voltage = np.repeat(rng.uniform(-9.0, 9.0, 100), 40)
     r, inductance, k, j, b = TABLE_1["rear_left"]
     turned = simulate(t, voltage, r, inductance, k, j, b, 0.3 * k / r, 0 * t, 50)[:, 2]
-    count = np.floor((turned + error * np.sin(turned + 1.0)) * 2000 / (2 * np.pi)).astype(np.int64)
-    found = estimate(Record("motor", t, voltage, count=count, hardware=Hardware(1.0, 2000.0)))
+    shown = turned + error * np.sin(turned + 1.0)
+    found = estimate(motors.counted(t, voltage, shown, 2000.0))
     assert ("encoder_error" in [f.code for f in found.findings]) == (error > 0)
     if error:
         size = found.combinations["encoder_error"]
@@ -116,8 +113,7 @@ def simulate_load(load, *, counts, seed, least=-9.0, back=SECONDS):
     friction = STATIC * motor[2] / motor[0]
     out = simulate(time, voltage, *motor, friction, friction * load, 40)
     if counts:
-        count = np.floor(out[:, 2] / motors.QUANTUM).astype(np.int64)
-        return Record("motor", time, voltage, count=count, hardware=Hardware(1.0, 500.0))
+        return motors.counted(time, voltage, out[:, 2])
     angle = np.concatenate([np.zeros(WINDOW), out[:, 2]])
     speed = (angle[WINDOW:] - angle[:-WINDOW]) * RATE / WINDOW
     speed += 0.2 * rng.standard_normal(time.size)
@@ -194,10 +190,9 @@ def test_delay_is_estimated_when_commands_are_logged_one_row_late(current):
     tones = rng.uniform(0.1, 2.0, 8)
     v = 2.5 * np.sin(2 * np.pi * np.outer(t, tones) + rng.uniform(0, 6, 8)).sum(axis=1)
     out = simulate(t, v, R, L, K, J, B, TC, np.zeros(t.size), 100)
-    count = np.floor(out[:, 2] * 500 / (2 * np.pi)).astype(np.int64)
     amps = out[:, 0] + 0.02 * rng.standard_normal(t.size) if current else None
     late = np.concatenate([v[:1], v[:-1]])
-    found = estimate(Record("motor", t, late, amps, count=count, hardware=Hardware(1.0, 500.0)))
+    found = estimate(motors.counted(t, late, out[:, 2], current=amps))
     assert not found.unreliable
     assert found.value("delay") == pytest.approx(-0.01, abs=3e-4)
     motors.check(found, TRUTH, ("dc_gain", "time_constant", "static_voltage"), most=0.02)
@@ -209,8 +204,7 @@ def test_delay_is_estimated_when_commands_are_logged_one_row_early(kind):
     v = excitation(t, kind, 9.0)
     ran = np.concatenate([v[:1], v[:-1]])  # over the interval that ends at each row
     out = simulate(t, ran, R, L, K, J, B, TC, np.zeros(t.size), 100)
-    count = np.floor(out[:, 2] * 500 / (2 * np.pi)).astype(np.int64)
-    record = Record("motor", t, v, count=count, hardware=Hardware(1.0, 500.0))
+    record = motors.counted(t, v, out[:, 2])
     assert_covered(record, TRUTH)
     delay = estimate(record).combinations["delay"]
     assert abs(delay.value - 1 / 200) < 4 * delay.std < 2e-3
@@ -220,8 +214,7 @@ def test_time_constant_interval_covers_truth_if_electrical_lag_is_one_sample():
     t = np.arange(8000) / 1000
     v = 9.0 * np.interp((t / 2.0) % 4.0, [0.0, 1.0, 3.0, 4.0], [0.0, 1.0, -1.0, 0.0])
     out = simulate(t, v, R, R / 1000, K, J, B, TC, np.zeros(t.size), 100)
-    count = np.floor(out[:, 2] * 500 / (2 * np.pi)).astype(np.int64)
-    found = estimate(Record("motor", t, v, count=count, hardware=Hardware(1.0, 500.0)))
+    found = estimate(motors.counted(t, v, out[:, 2]))
     lag = found.combinations["time_constant"]
     assert lag.total_ci95[0] < (R * J + R / 1000 * B) / (R * B + K * K) < lag.total_ci95[1]
 
@@ -261,9 +254,9 @@ def late_counts(rng, v, rate, per_turn, late, motor, noise=None):
     ran = np.concatenate([np.full(1 + late, v[0]), np.repeat(v[1:], 10)])[: 10 * (samples - 1) + 1]
     fine = np.arange(ran.size) / (10 * rate)
     out = simulate(fine, ran, *motor, np.zeros(ran.size), 10)[::10]
-    count = np.floor(out[:, 2] * per_turn / (2 * np.pi) + rng.uniform()).astype(np.int64)
+    angle = out[:, 2] + rng.uniform() * 2 * np.pi / per_turn
     current = None if noise is None else out[:, 0] + noise * rng.standard_normal(samples)
-    return Record("motor", t, v, current, count=count, hardware=Hardware(1.0, per_turn))
+    return motors.counted(t, v, angle, per_turn, current)
 
 
 @pytest.mark.parametrize("late", [3, 4])
@@ -307,8 +300,7 @@ def test_initial_state_of_held_out_data_is_estimated():
     t = np.arange(3000) / 1000
     v = np.repeat(rng.uniform(2.0, 9.0, 100), 30)
     out = simulate(t, v, R, 4e-5 * R, K, J, 0.0, 1.5e-2, np.zeros(t.size), 100)
-    count = np.floor(out[:, 2] * 2000 / (2 * np.pi)).astype(np.int64)
-    found = estimate(Record("motor", t, v, count=count, hardware=Hardware(1.0, 2000.0)))
+    found = estimate(motors.counted(t, v, out[:, 2], 2000.0))
     assert found.fit_percent.validation > 97
     assert "validation" not in [f.code for f in found.findings]
 

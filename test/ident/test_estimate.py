@@ -222,8 +222,7 @@ def test_load_larger_than_friction_is_estimated():
     steps = np.concatenate([up, up[-2::-1], -up[1:], -up[-2::-1]])
     volts = np.resize(np.repeat(steps, 65), t.size)
     motion = simulate(t, volts, R, L, K, J, B, TC, np.full(t.size, load), 40)
-    count = np.floor(motion[:, 2] * 2000 / (2 * np.pi) + 0.637).astype(np.int64)
-    found = estimate(Record("motor", t, volts, count=count, hardware=Hardware(1.0, 2000.0)))
+    found = estimate(motors.counted(t, volts, motion[:, 2] + 2e-3, 2000.0))
     truth = {
         "dc_gain": K / (K * K + R * B),
         "static_voltage": R * TC / K,
@@ -298,9 +297,9 @@ def test_quantised_angle_is_treated_as_counts(per_turn):
     v = excitation(t, "fourier", 9.0)
     out = simulate(t, v, R, L, K, J, B, TC, np.zeros(t.size), 100)
     step = 2 * np.pi / per_turn
-    count = np.floor(out[:, 2] / step).astype(np.int64)
-    counted = estimate(Record("motor", t, v, count=count, hardware=Hardware(1.0, per_turn)))
-    angle = np.round(count * step + 0.3, 6)  # as a text file has it
+    record = motors.counted(t, v, out[:, 2], per_turn)
+    counted = estimate(record)
+    angle = np.round(record.count * step + 0.3, 6)  # as a text file has it
     found = estimate(Record("motor", t, v, position=angle))
     assert found.model == counted.model
     for name, q in counted.combinations.items():

@@ -27,6 +27,7 @@ MOTORS = Path(__file__).resolve().parents[2] / "config" / "motors_paper.yaml"
 WHEEL, STEP, REST, LASTS = "front_left", 0.005, 0.3, 1.2
 ESTIMATE = read_estimates(MOTORS)[WHEEL]
 ENTRY = load_motors(MOTORS)[WHEEL]
+LOOP = {"sample_time": STEP, "delay": STEP, "supply_voltage": 12.0}
 
 
 @pytest.fixture(scope="module")
@@ -36,7 +37,6 @@ def designed() -> Design:
 
 def drive(one, entry=ENTRY, load=0.0, late=0.0, wait=0.0, offset=0.0):
     """Return the set-point change of a simulated motor, evaluated as by commission."""
-    document = {"sample_time": STEP, "delay": STEP, "supply_voltage": 12.0}
     setpoint = one.specification.change / one.loop.gear_ratio
     run = simulate_closed_loop(
         entry,
@@ -55,7 +55,7 @@ def drive(one, entry=ENTRY, load=0.0, late=0.0, wait=0.0, offset=0.0):
     rows = v.predict_speed(
         ESTIMATE,
         parameters(one),
-        document,
+        LOOP,
         np.where(instants < 0.0, 0.0, setpoint),
         (instants, np.full(instants.size, STEP + wait)),
         even[kept],
@@ -82,14 +82,13 @@ def test_prediction_includes_sampling_jitter(designed):
 
 
 def test_prediction_includes_unanswered_samples(designed):
-    loop = {"sample_time": STEP, "delay": STEP, "supply_voltage": 12.0}
     instants = STEP * np.arange(-60, 240)
     # 60 ms without control while the wheel accelerates: the held voltage is too large.
     silent = np.where((instants > 0.05) & (instants < 0.11), np.nan, 0.0)
     setpoints = np.where(instants < 0.0, 0.0, 1.0)
     rows = [
         v.predict_speed(
-            ESTIMATE, parameters(designed), loop, setpoints, (instants, ages), instants[60:230]
+            ESTIMATE, parameters(designed), LOOP, setpoints, (instants, ages), instants[60:230]
         )[0]
         for ages in (np.zeros(instants.size), silent)
     ]
@@ -115,10 +114,9 @@ def test_prediction_includes_the_integral_left_by_the_previous_change(designed):
     turn = ENTRY.gearbox.to_wheel(ENTRY.encoder.angle_per_count)
     even, speed = v.smooth_speed(run.time, turn * run.count, STEP)
     estimate = replace(ESTIMATE, combinations=known)
-    loop = {"sample_time": STEP, "delay": STEP, "supply_voltage": 12.0}
     setpoints = np.array([asked(t) for t in run.time])
     answers = (run.time, np.full(run.time.size, STEP))
-    row = v.predict_speed(estimate, parameters(designed), loop, setpoints, answers, even)[0]
+    row = v.predict_speed(estimate, parameters(designed), LOOP, setpoints, answers, even)[0]
     assert np.abs(row - speed).max() < 0.02 * setpoint
 
 

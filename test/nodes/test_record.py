@@ -3,7 +3,6 @@
 
 import re
 import signal
-import threading
 import time
 from collections.abc import Callable, Iterator
 from itertools import chain
@@ -18,6 +17,7 @@ from recordings import Sent, write_mcap
 from rosbags.rosbag2 import Reader
 from rosgraph_msgs.msg import Clock
 from std_msgs.msg import Float64, String
+from wheel_robot import spinning
 
 from smp_interfaces.msg import MotorDescription, MotorState
 from smp_motor_control import WHEELS
@@ -245,16 +245,13 @@ def write_bag(path: Path, count: int = 100, step: int = 10_000_000) -> dict[str,
 
 
 class Listener:
-    """Receives raw topics in its own thread, with the time of each message."""
+    """Receives raw topics, with the time of each message."""
 
     def __init__(self, node: Node, topics: dict[str, Any]) -> None:
         self.data: dict[str, list[bytes]] = {name: [] for name in topics}
         self.times: dict[str, list[float]] = {name: [] for name in topics}
         for name, kind in topics.items():
             node.create_subscription(kind, name, self._taker(name), RELIABLE, raw=True)
-        self._node, self._over = node, threading.Event()
-        self._thread = threading.Thread(target=self._spin, daemon=True)
-        self._thread.start()
 
     def _taker(self, name: str) -> Callable[[bytes], None]:
         def take(data: bytes) -> None:
@@ -263,20 +260,12 @@ class Listener:
 
         return take
 
-    def _spin(self) -> None:
-        while not self._over.is_set():
-            self._node.spin()  # type: ignore[attr-defined]
-
-    def close(self) -> None:
-        self._over.set()
-        self._thread.join()
-
 
 @pytest.fixture
 def listener(node: Node) -> Iterator[Listener]:
     made = Listener(node, {"/number": Float64, "/text": String, "/clock": Clock})
-    yield made
-    made.close()
+    with spinning(node.spin):  # type: ignore[attr-defined]
+        yield made
 
 
 def test_play_reproduces_bytes_and_times(process, listener, eventually, tmp_path):

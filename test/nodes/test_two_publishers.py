@@ -11,7 +11,7 @@ from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState, GetState
 from sensor_msgs.msg import JointState
 from std_msgs.msg import String
-from wheel_robot import DomainNode
+from wheel_robot import DomainNode, spinning
 
 from smp_interfaces.msg import MotorCommand, MotorState
 from smp_motor_control.nodes.publishers import DECISIVE_FALLS, PublisherWatch
@@ -92,12 +92,19 @@ def parameter_arguments(*parameters: str) -> list[str]:
     return ["--ros-args", *(part for one in parameters for part in ("-p", one))]
 
 
-def test_every_reader_reports_both_publishers_and_the_wheel_stops(process, robot, eventually):
+@pytest.fixture
+def readers(process) -> None:
+    """Start the nodes that read the states of the wheels."""
     process("wheel_pid", *STUCK)
     process(
         "skid_steer", *parameter_arguments("left_wheel_names:=[left]", "right_wheel_names:=[right]")
     )
     process("identifier", *parameter_arguments("wheels:=[left]", "period:=0.5"))
+
+
+def test_every_reader_reports_both_publishers_and_the_wheel_stops(
+    process, robot, readers, eventually
+):
     recorder = process("record", "--output", "bag")
     nodes = ("left/wheel_pid", "skid_steer", "identifier")
     eventually(lambda: set(nodes) <= set(robot.said), 20.0, robot.run)
@@ -139,13 +146,8 @@ def test_client_refuses_wheel_with_two_publishers(robot):
                 client.wait_for_wheels(WHEELS, 20.0)
 
 
-def test_unstamped_states_are_reported_and_refused_by_tools(process, robot, eventually):
+def test_unstamped_states_are_reported_and_refused_by_tools(robot, readers, eventually):
     robot.driver.stamped = False
-    process("wheel_pid", *STUCK)
-    process(
-        "skid_steer", *parameter_arguments("left_wheel_names:=[left]", "right_wheel_names:=[right]")
-    )
-    process("identifier", *parameter_arguments("wheels:=[left]", "period:=0.5"))
     for name in ("left/wheel_pid", "skid_steer"):
         eventually(lambda name=name: "no stamp" in robot.said.get(name, ""), 20.0, robot.run)
     # The arrival replaces the stamp: the wheel is driven, and its feedback used.
@@ -204,17 +206,8 @@ class Wheel:
 @pytest.fixture
 def wheel(node):
     wheel = Wheel(node)
-
-    def spin() -> None:
-        while not ended.is_set():
-            node.spin()
-
-    ended = threading.Event()
-    thread = threading.Thread(target=spin)
-    thread.start()
-    yield wheel
-    ended.set()
-    thread.join()
+    with spinning(node.spin):
+        yield wheel
 
 
 def test_controller_known_only_to_driver_is_paused_and_reactivated(wheel):

@@ -3,12 +3,12 @@
 
 import numpy as np
 import pytest
-from motors import simulate
+from motors import counted, simulate
 from recordings import START, codes, floats, in_order, read, read_table
 
 from smp_motor_ident.estimate import estimate
 from smp_motor_ident.quality.stamps import find_beat, move_to_beat
-from smp_motor_ident.record import Hardware, Record
+from smp_motor_ident.record import Record
 
 T = 10_000_000  # ns
 MAP = ["voltage=u velocity=y time=t"]
@@ -90,10 +90,8 @@ def _record_with_late_stamps(kind: str, seed: int) -> tuple[Record, float]:
     if kind == "bursts":
         stamp = t[np.minimum((np.arange(t.size) // 4 + 1) * 4, t.size - 1)]
     stamp = np.maximum.accumulate(stamp) + 1e-9 * np.arange(t.size)
-    count = np.floor(out[:, 2] * 500 / (2 * np.pi)).astype(np.int64)
     current = out[:, 0] + 0.02 * rng.standard_normal(t.size)
-    hardware = Hardware(1.0, 500.0)
-    return Record("m", stamp - stamp[0], v, current, count=count, hardware=hardware), l / r
+    return counted(stamp - stamp[0], v, out[:, 2], current=current), l / r
 
 
 @pytest.mark.parametrize("kind", ["exponential", "bursts"])

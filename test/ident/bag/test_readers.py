@@ -102,9 +102,8 @@ def test_matlab_objects_are_reported_and_other_variables_read(tmp_path, compress
     path.write_bytes(whole[:128] + one + whole[128:] + two)
     record = read_records(path, MAP)["motor"]
     assert_motor(record)
-    said = [f.message for f in record.findings if f.code == "matlab_object"]
-    assert len(said) == 1
-    assert "speedSeries (timeseries), out (Simulink.Data)" in said[0]
+    (said,) = [f.message for f in record.findings if f.code == "matlab_object"]
+    assert "speedSeries (timeseries), out (Simulink.Data)" in said
     path.write_bytes(whole[:128] + one)
     with pytest.raises(BagError, match=r"speedSeries \(timeseries\); save its Time and Data as"):
         list_topics(path)
@@ -122,8 +121,8 @@ def test_matlab_7_3_objects_are_reported_and_other_variables_read(tmp_path):
         raw.write(b"MATLAB 7.3 MAT-file".ljust(124) + b"\x00\x02IM")
     record = read_records(path, MAP)["motor"]
     assert_motor(record)
-    said = [f.message for f in record.findings if f.code == "matlab_object"]
-    assert len(said) == 1 and "data (Simulink.SimulationData.Dataset)" in said[0]
+    (said,) = [f.message for f in record.findings if f.code == "matlab_object"]
+    assert "data (Simulink.SimulationData.Dataset)" in said
 
 
 def test_signals_in_rows_of_matlab_4_file_are_read(tmp_path):
