@@ -16,6 +16,7 @@ from processes import own_domain, processes
 from rcl_interfaces.srv import GetParameters, SetParameters
 from rclpy.parameter import Parameter
 from sensor_msgs.msg import JointState
+from wheel_robot import spinning
 
 from smp_interfaces.msg import MotorState
 from smp_motor_control import WHEELS
@@ -34,10 +35,7 @@ SPEED = 1.2
 
 
 class Robot:
-    """Drive the running wheels at one speed and store their states.
-
-    It spins in its own thread, so set-points continue while a test waits.
-    """
+    """Drives the running wheels at one speed and stores their states."""
 
     def __init__(self) -> None:
         self.node = rclpy.create_node("test_apply")
@@ -57,17 +55,8 @@ class Robot:
             self.writers[wheel] = self.node.create_client(SetParameters, f"{name}/set_parameters")
         self.executor = LeanExecutor()
         self.executor.add_node(self.node)
-        self.running = True
-        self.thread = threading.Thread(target=self._spin, daemon=True)
-        self.thread.start()
-
-    def _spin(self) -> None:
-        while self.running:
-            self.executor.spin_once()
 
     def close(self) -> None:
-        self.running = False  # the timer of the set-points ends the wait
-        self.thread.join(5.0)
         self.executor.shutdown()
         self.node.destroy_node()
 
@@ -147,8 +136,10 @@ def running(ros_domain, eventually, tmp_path_factory):
         one = Robot()
         one.processes = pids
         try:
-            eventually(one.at_speed, 30.0, message="\n".join(p.output for p in started))
-            yield one
+            # In a thread, so that set-points continue while a test waits.
+            with spinning(one.executor.spin_once):
+                eventually(one.at_speed, 30.0, message="\n".join(p.output for p in started))
+                yield one
         finally:
             one.close()
             rclpy.shutdown()

@@ -8,7 +8,6 @@ import json
 import re
 import signal
 import subprocess
-import threading
 import time
 from collections.abc import Iterator
 
@@ -16,7 +15,7 @@ import pytest
 import yaml
 from browser import AXE, Clicks, violations
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
-from wheel_robot import DomainNode, two_wheeled
+from wheel_robot import DomainNode, spinning, two_wheeled
 
 from smp_interfaces.msg import MotorState
 from smp_motor_control import WHEELS
@@ -31,7 +30,7 @@ LOST_S = 0.3  # silence of a page that counts as a lost connection
 
 
 class Watcher(DomainNode):
-    """Listens to the wheels in a thread."""
+    """Listens to the wheels."""
 
     def __init__(self, domain: int, wheels: tuple[str, ...]) -> None:
         super().__init__(domain, "watcher")
@@ -42,22 +41,10 @@ class Watcher(DomainNode):
                 MotorState, topic, lambda m, wheel=wheel: self._take(wheel, m), 100
             )
         self.reports = self.node.create_publisher(DiagnosticArray, "/diagnostics", 10)
-        self._ended = False
-        self._thread = threading.Thread(target=self._run, daemon=True)
-        self._thread.start()
 
     def _take(self, wheel: str, message: MotorState) -> None:
         stamp = message.header.stamp
         self.samples[wheel].append((stamp.sec + 1e-9 * stamp.nanosec, message.velocity))
-
-    def _run(self) -> None:
-        while not self._ended:
-            self.executor.spin_once(timeout_sec=0.05)
-
-    def close(self) -> None:
-        self._ended = True
-        self._thread.join()
-        super().close()
 
     def speeds(self) -> list[float]:
         return [one[-1][1] if one else 0.0 for one in self.samples.values()]
@@ -70,15 +57,15 @@ class Watcher(DomainNode):
 
 @pytest.fixture
 def watcher(ros_domain):
-    made = []
+    with contextlib.ExitStack() as stack:
 
-    def make(*wheels):
-        made.append(Watcher(ros_domain, wheels))
-        return made[-1]
+        def make(*wheels):
+            made = Watcher(ros_domain, wheels)
+            stack.callback(made.close)
+            stack.enter_context(spinning(lambda: made.executor.spin_once(timeout_sec=0.05)))
+            return made
 
-    yield make
-    for one in made:
-        one.close()
+        yield make
 
 
 def address(lab, eventually, after: int = 0) -> str:
