@@ -4,8 +4,9 @@
     python benchmarks/replay.py demo_output        # of make demo: excitation and identification
 
 Plays the excitation in its own time, waits until every wheel's last window was estimated, and
-prints which values lie outside of the 95 % intervals of ``identify``, how many deviations off, and
-the share of a processor that ``identifier`` took while the bag was played.
+prints which values lie outside of the 95 % intervals of ``identify``, systematic uncertainty
+included, how many deviations off, and the share of a processor that ``identifier`` took while the bag
+was played.
 """
 
 from __future__ import annotations
@@ -81,7 +82,7 @@ def main(folder: Path) -> int:
         off = [
             f"{name} by {(value - held[name].value) / held[name].std:+.2g} deviations"
             for name, value in zip(message.names, message.values)
-            if held[name].ci95 and not held[name].ci95[0] <= value <= held[name].ci95[1]
+            if (ends := held[name].total_ci95) and not ends[0] <= value <= ends[1]
         ]
         outside += bool(off) or not message.names
         print(f"{wheel}: {message.status}: {', '.join(off) or 'all within the intervals'}")

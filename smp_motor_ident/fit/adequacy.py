@@ -39,7 +39,7 @@ class Scatter:
 
 
 def leaves_only_rounding(data: Data, motion: Array) -> bool:
-    """Tell whether a simulated motion leaves only the rounding of counts, or of their difference."""
+    """Tell whether a simulated motion leaves only the rounding of counts or their difference."""
     own = data.quantum / math.sqrt(12 if data.is_angle else 6)
     return float(np.nanstd(data.motion - motion)) < MAX_ROUNDING_RATIO * own
 
