@@ -3,10 +3,9 @@
 
     python benchmarks/replay.py demo_output        # of make demo: excitation and identification
 
-Plays the excitation in its own time, waits until every wheel's last window was estimated, and
-prints which values lie outside of the 95 % intervals of ``identify``, systematic uncertainty
-included, how many deviations off, and the share of a processor that ``identifier`` took while the bag
-was played.
+Plays the excitation in its own time and waits until every wheel's last window was estimated.
+Prints which values lie outside of the 95 % intervals of ``identify``, systematic uncertainty
+included, how many deviations off, and the share of a processor that ``identifier`` took.
 """
 
 from __future__ import annotations
