@@ -72,6 +72,9 @@ class Component:
     severity: ClassVar[Severity] = "note"  # of the finding that names it
     advice: ClassVar[str] = ""  # what to do about it
     parameters: ClassVar[tuple[Parameter, ...]] = ()
+    places: ClassVar[tuple[int, ...]] = ()  # in the simulation's lanes, of its first parameters
+    # Sizes of its last parameter, in that one's unit, at which a fit with it may begin
+    guesses: ClassVar[tuple[float, ...]] = ()
     prior: ClassVar[float] = 0.1  # probability of its presence in a recording
     rank: ClassVar[int] = 0  # place among the components that shape a command, the lowest first
     linear: ClassVar[str] = ""  # parameter that its effect is proportional to
@@ -85,6 +88,8 @@ class Component:
 
     def write(self, p: Values, lanes: Array) -> None:
         """Put parameters of the simulation, one column a lane."""
+        for place, parameter in zip(self.places, self.parameters):
+            lanes[place] = p[parameter.name]
 
     def shape_command(self, p: Values, command: Array, rows: Rows, scales: Scales) -> Array:
         """Return the voltage [V] that a driver makes of a command, shape (sections, lanes)."""
@@ -92,7 +97,8 @@ class Component:
 
     def starts(self, scales: Scales) -> Sequence[Mapping[str, float]]:
         """Return sizes at which a fit with this component may begin."""
-        return ()
+        last = self.parameters[-1:]
+        return [{p.name: guess * scales.of(p.unit)} for p in last for guess in self.guesses]
 
     def starts_in(
         self, values: Mapping[str, float], scales: Scales

@@ -3,8 +3,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-
 import numpy as np
 
 from smp_motor_control.arrays import Array, Integers
@@ -12,10 +10,6 @@ from smp_motor_ident._compile import compiled
 from smp_motor_ident.chain.component import Component, Parameter, Scales, Values
 from smp_motor_ident.simulate import lanes as at
 from smp_motor_ident.simulate.rows import Rows
-
-
-def _scale_sizes(name: str, *sizes: float) -> list[dict[str, float]]:
-    return [{name: size} for size in sizes]
 
 
 class DeadZone(Component):
@@ -26,27 +20,21 @@ class DeadZone(Component):
     advice = "set the dead zone of the driver or firmware to zero, or compensate it in the command"
     linear = "dead_zone"
     parameters = (Parameter("dead_zone", "V", 0.0, 0.6, typical=0.03),)
+    guesses = (0.02, 0.1)
 
     def shape_command(self, p: Values, command: Array, rows: Rows, scales: Scales) -> Array:
         """Return the command less the dead zone."""
         return command - np.clip(command, -p["dead_zone"], p["dead_zone"])
 
-    def starts(self, scales: Scales) -> Sequence[Mapping[str, float]]:
-        """Return small and large dead zones."""
-        return _scale_sizes("dead_zone", *(x * scales.volts for x in (0.02, 0.1)))
-
 
 class HardDeadZone(Component):
     """A driver that ignores commands below a size [V] and applies larger ones in full."""
 
-    code, slot, title = (
-        "hard_dead_zone",
-        "dead_zone",
-        "driver that ignores small commands",
-    )
+    code, slot, title = "hard_dead_zone", "dead_zone", "driver that ignores small commands"
     severity = "warning"
     advice = "lower the least command of the firmware, or keep commands above it"
     parameters = (Parameter("least_command", "V", 0.0, 0.6, typical=0.1, threshold=True),)
+    guesses = tuple(0.03 * k for k in range(1, 17))  # every level of a command falls between two
     EDGE_SHARE = 0.02
     """Share of the largest command over which it sets in, so that it has a derivative."""
 
@@ -54,10 +42,6 @@ class HardDeadZone(Component):
         """Return the command where it is large enough."""
         beyond = (np.abs(command) - p["least_command"]) / (self.EDGE_SHARE * scales.volts)
         return command * np.clip(beyond + 0.5, 0.0, 1.0)
-
-    def starts(self, scales: Scales) -> Sequence[Mapping[str, float]]:
-        """Return sizes so close that every level of a command falls between two."""
-        return _scale_sizes("least_command", *(0.03 * k * scales.volts for k in range(1, 17)))
 
 
 class Clip(Component):
@@ -70,14 +54,11 @@ class Clip(Component):
     linear = "clip_voltage"
     needs_own_start = True
     parameters = (Parameter("clip_voltage", "V", 0.05, 1.0, neutral=1.0, typical=0.1),)
+    guesses = (0.95, 0.85, 0.7, 0.5)
 
     def shape_command(self, p: Values, command: Array, rows: Rows, scales: Scales) -> Array:
         """Return the command within the limit."""
         return np.clip(command, -p["clip_voltage"], p["clip_voltage"])
-
-    def starts(self, scales: Scales) -> Sequence[Mapping[str, float]]:
-        """Return limits below the largest command."""
-        return _scale_sizes("clip_voltage", *(x * scales.volts for x in (0.95, 0.85, 0.7, 0.5)))
 
 
 class WeakSide(Component):
@@ -89,14 +70,11 @@ class WeakSide(Component):
     rank = 1
     linear = "weak_side"
     parameters = (Parameter("weak_side", "1", -0.5, 0.5, typical=0.02),)
+    guesses = (0.03,)
 
     def shape_command(self, p: Values, command: Array, rows: Rows, scales: Scales) -> Array:
         """Return the command, in reverse reduced."""
         return np.asarray(command * (1 - np.where(command < 0, p["weak_side"], 0.0)))
-
-    def starts(self, scales: Scales) -> Sequence[Mapping[str, float]]:
-        """Return a weakness of either side."""
-        return _scale_sizes("weak_side", 0.03)
 
 
 class Slew(Component):
@@ -110,6 +88,7 @@ class Slew(Component):
     needs_own_start = True
     lag, lateness = "ramp_time", 0.5
     parameters = (Parameter("ramp_time", "s", 0.0, 20.0, typical=0.3),)
+    guesses = (0.2, 0.6, 1.5, 4.0)
 
     def shape_command(self, p: Values, command: Array, rows: Rows, scales: Scales) -> Array:
         """Return the mean voltage of every section, behind the limit."""
@@ -123,10 +102,6 @@ class Slew(Component):
         shaped = np.broadcast_to(command, (command.shape[0], rate.size))
         return _limit_slew(np.ascontiguousarray(shaped), length, rows.section, rate)
 
-    def starts(self, scales: Scales) -> Sequence[Mapping[str, float]]:
-        """Return ramps around the motor's own lag."""
-        return _scale_sizes("ramp_time", *(x * scales.lag for x in (0.2, 0.6, 1.5, 4.0)))
-
 
 class Sag(Component):
     """A supply with a resistance of its own, over that of the armature."""
@@ -136,32 +111,19 @@ class Sag(Component):
     advice = "record the supply voltage, or use a battery of lower resistance"
     linear = "source_resistance_ratio"
     parameters = (Parameter("source_resistance_ratio", "1", 0.0, 5.0, typical=0.05),)
-
-    def write(self, p: Values, lanes: Array) -> None:
-        """Put the ratio."""
-        lanes[at.SAG] = p["source_resistance_ratio"]
-
-    def starts(self, scales: Scales) -> Sequence[Mapping[str, float]]:
-        """Return good and poor supplies."""
-        return _scale_sizes("source_resistance_ratio", 0.05, 0.3)
+    guesses = (0.05, 0.3)
+    places = (at.SAG,)
 
 
 class Drop(Component):
     """A constant voltage drop over brushes or transistors [V]."""
 
     code, slot, title = "brush_drop", "drop", "voltage drop over brushes or transistors"
-    severity = "note"
     advice = "record the voltage at the terminals so that the estimates exclude the driver"
     linear = "brush_drop"
     parameters = (Parameter("brush_drop", "V", 0.0, 0.4, typical=0.03),)
-
-    def write(self, p: Values, lanes: Array) -> None:
-        """Put the drop."""
-        lanes[at.DROP] = p["brush_drop"]
-
-    def starts(self, scales: Scales) -> Sequence[Mapping[str, float]]:
-        """Return small and large drops."""
-        return _scale_sizes("brush_drop", *(x * scales.volts for x in (0.02, 0.1)))
+    guesses = (0.02, 0.1)
+    places = (at.DROP,)
 
 
 class CurrentLimit(Component):
@@ -173,14 +135,8 @@ class CurrentLimit(Component):
     linear = "current_limit_voltage"
     needs_own_start = True
     parameters = (Parameter("current_limit_voltage", "V", 0.02, 2.0, neutral=2.0, typical=0.5),)
-
-    def write(self, p: Values, lanes: Array) -> None:
-        """Put the limit."""
-        lanes[at.CURRENT_LIMIT] = p["current_limit_voltage"]
-
-    def starts(self, scales: Scales) -> Sequence[Mapping[str, float]]:
-        """Return limits that reversals, and such that steps reach."""
-        return _scale_sizes("current_limit_voltage", *(x * scales.volts for x in (1.5, 0.8, 0.4)))
+    guesses = (1.5, 0.8, 0.4)  # of reversals, then such as steps reach
+    places = (at.CURRENT_LIMIT,)
 
 
 class FastDecay(Component):
@@ -194,32 +150,19 @@ class FastDecay(Component):
     )
     needs_own_start = True
     parameters = (Parameter("fast_decay_ratio", "1", 0.02, 300.0),)
-
-    def write(self, p: Values, lanes: Array) -> None:
-        """Put the ratio."""
-        lanes[at.DECAY] = p["fast_decay_ratio"]
-
-    def starts(self, scales: Scales) -> Sequence[Mapping[str, float]]:
-        """Return slow and fast PWM."""
-        return _scale_sizes("fast_decay_ratio", 0.1, 0.5, 2.0, 10.0)
+    guesses = (0.1, 0.5, 2.0, 10.0)
+    places = (at.DECAY,)
 
 
 class FreeAtZero(Component):
     """A bridge that is open while the command is zero: share of the back-EMF at the terminals."""
 
     code, slot, title = "coast_at_zero", "free", "driver that lets the motor coast at zero"
-    severity = "note"
     advice = "let the driver brake at zero command"
     linear = "coasting_share"
     parameters = (Parameter("coasting_share", "1", 0.0, 1.0, typical=0.1),)
-
-    def write(self, p: Values, lanes: Array) -> None:
-        """Put the share."""
-        lanes[at.FREE] = p["coasting_share"]
-
-    def starts(self, scales: Scales) -> Sequence[Mapping[str, float]]:
-        """Return an open bridge."""
-        return _scale_sizes("coasting_share", 0.9)
+    guesses = (0.9,)
+    places = (at.FREE,)
 
 
 class Decline(Component):
@@ -230,14 +173,8 @@ class Decline(Component):
     advice = "charge the battery, or record the supply voltage"
     linear = "decline"
     parameters = (Parameter("decline", "1", -0.5, 0.8, typical=0.02),)
-
-    def write(self, p: Values, lanes: Array) -> None:
-        """Put the share."""
-        lanes[at.DECLINE] = p["decline"]
-
-    def starts(self, scales: Scales) -> Sequence[Mapping[str, float]]:
-        """Return a slight decline."""
-        return _scale_sizes("decline", 0.03)
+    guesses = (0.03,)
+    places = (at.DECLINE,)
 
 
 @compiled

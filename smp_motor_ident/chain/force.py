@@ -18,10 +18,7 @@ class AsymmetricFriction(Component):
         Parameter("vc", "V", 0.0, 1.0),
         Parameter("vc_reverse", "V", 0.0, 1.0),
     )
-
-    def write(self, p: Values, lanes: Array) -> None:
-        """Put friction in both directions."""
-        lanes[at.VC_PLUS], lanes[at.VC_MINUS] = p["vc"], p["vc_reverse"]
+    places = (at.VC_PLUS, at.VC_MINUS)
 
     def starts_in(
         self, values: Mapping[str, float], scales: Scales
@@ -57,10 +54,7 @@ class Stribeck(Component):
         Parameter("stribeck", "1", 0.0, 10.0, typical=0.3),
         Parameter("stribeck_speed", "rad/s", 0.003, 0.5),
     )
-
-    def write(self, p: Values, lanes: Array) -> None:
-        """Put share and speed."""
-        lanes[at.STRIBECK], lanes[at.STRIBECK_SPEED] = p["stribeck"], p["stribeck_speed"]
+    places = (at.STRIBECK, at.STRIBECK_SPEED)
 
     def starts(self, scales: Scales) -> Sequence[Mapping[str, float]]:
         """Return a share within a small and a larger speed."""
@@ -75,18 +69,11 @@ class FrictionDrift(Component):
         "friction_drift",
         "friction that changes during the recording",
     )
-    severity = "note"
     advice = "let the gearbox warm up before recording"
     linear = "friction_drift"
     parameters = (Parameter("friction_drift", "1", -0.95, 3.0, typical=0.1),)
-
-    def write(self, p: Values, lanes: Array) -> None:
-        """Put the share."""
-        lanes[at.FRICTION_DRIFT] = p["friction_drift"]
-
-    def starts(self, scales: Scales) -> Sequence[Mapping[str, float]]:
-        """Return friction that warms up."""
-        return [{"friction_drift": -0.2}]
+    guesses = (-0.2,)  # it warms up
+    places = (at.FRICTION_DRIFT,)
 
 
 class LoadStep(Component):
@@ -101,10 +88,7 @@ class LoadStep(Component):
         Parameter("load_step", "V", -1.0, 1.0, typical=0.05),
         Parameter("load_step_at", "1", 0.0, 1.0),
     )
-
-    def write(self, p: Values, lanes: Array) -> None:
-        """Put the load and its beginning."""
-        lanes[at.LOAD_STEP], lanes[at.LOAD_STEP_AT] = p["load_step"], p["load_step_at"]
+    places = (at.LOAD_STEP, at.LOAD_STEP_AT)
 
     def starts(self, scales: Scales) -> Sequence[Mapping[str, float]]:
         """Return loads that begin early and late."""

@@ -79,6 +79,7 @@ class Friction(Component):
     linear = "vc"
     prior = 0.9
     parameters = (Parameter("vc", "V", 0.0, 1.0, typical=0.05),)
+    guesses = (0.02, 0.1)  # of a good and of a poor gearbox
 
     def write(self, p: Values, lanes: Array) -> None:
         """Put friction in both directions."""
@@ -87,10 +88,6 @@ class Friction(Component):
     def list_priors(self, scales: Scales) -> Sequence[tuple[Mapping[str, float], float, float]]:
         """Return values of geared motors."""
         return (({"vc": 1.0}, 0.05 * scales.volts, 0.15 * scales.volts),)
-
-    def starts(self, scales: Scales) -> Sequence[Mapping[str, float]]:
-        """Return friction of a good and of a poor gearbox."""
-        return [{"vc": share * scales.volts} for share in (0.02, 0.1)]
 
 
 class Load(Component):
@@ -101,14 +98,8 @@ class Load(Component):
     linear = "load"
     prior = 0.3
     parameters = (Parameter("load", "V", -1.0, 1.0, typical=0.02),)
-
-    def write(self, p: Values, lanes: Array) -> None:
-        """Put the load."""
-        lanes[at.LOAD] = p["load"]
-
-    def starts(self, scales: Scales) -> Sequence[Mapping[str, float]]:
-        """Return loads in either direction."""
-        return [{"load": share * scales.volts} for share in (0.03, -0.2, 0.2)]
+    guesses = (0.03, -0.2, 0.2)
+    places = (at.LOAD,)
 
 
 class Delay(Component):
@@ -119,7 +110,4 @@ class Delay(Component):
     lag = "delay"
     prior = 0.3
     parameters = (Parameter("delay", "row", -8.0, 1000.0, typical=1.0),)
-
-    def starts(self, scales: Scales) -> Sequence[Mapping[str, float]]:
-        """Return delays of a few rows."""
-        return [{"delay": rows * scales.step} for rows in (-1.0, 0.5, 1.0, 2.0, 4.0)]
+    guesses = (-1.0, 0.5, 1.0, 2.0, 4.0)

@@ -64,14 +64,11 @@ class MeanSpeed(Sensor):
     lag, lateness = "window", 0.5
     needs_own_start = True
     parameters = (Parameter("window", "row", 0.0, 200.0, typical=2.0),)
+    guesses = (1.0, 2.0, 5.0, 16.0, 40.0)
 
     def sense(self, p: Values, motion: Motion, rows: Rows, scales: Scales) -> Array:
         """Return ``(th(t) - th(t - window)) / window``."""
         return _mean_speed(rows.time, rows.segment, motion.speed, motion.angle, p["window"])
-
-    def starts(self, scales: Scales) -> Sequence[Mapping[str, float]]:
-        """Return windows of one to forty rows."""
-        return [{"window": n * scales.step} for n in (1.0, 2.0, 5.0, 16.0, 40.0)]
 
 
 class DifferencedSpeed(MeanSpeed):
@@ -94,14 +91,11 @@ class LowPassedSpeed(Sensor):
     lag = "sensor_lag"
     needs_own_start = True
     parameters = (Parameter("sensor_lag", "s", 0.0, 20.0, typical=0.2),)
+    guesses = (0.1, 0.4, 1.0, 3.0)
 
     def sense(self, p: Values, motion: Motion, rows: Rows, scales: Scales) -> Array:
         """Return ``s`` of ``lag s' = w - s``."""
         return _low_pass(rows.time, rows.segment, motion.speed, motion.angle, p["sensor_lag"])
-
-    def starts(self, scales: Scales) -> Sequence[Mapping[str, float]]:
-        """Return lags around that of the motor."""
-        return [{"sensor_lag": x * scales.lag} for x in (0.1, 0.4, 1.0, 3.0)]
 
 
 class Current(Sensor):
@@ -130,6 +124,7 @@ class MeanCurrent(Current):
 
     code, title = "averaged_current", "averaged current"
     parameters = (Current.OFFSET, Parameter("current_window", "row", 0.0, 100.0, typical=1.0))
+    guesses = (0.6, 1.0, 3.0)
     needs_charge = True
 
     def filtered(self, p: Values, motion: Motion, rows: Rows, scales: Scales) -> Array:
@@ -137,10 +132,6 @@ class MeanCurrent(Current):
         return _mean_speed(
             rows.time, rows.segment, motion.drive, motion.charge, p["current_window"]
         )
-
-    def starts(self, scales: Scales) -> Sequence[Mapping[str, float]]:
-        """Return windows of one to some rows."""
-        return [{"current_window": n * scales.step} for n in (0.6, 1.0, 3.0)]
 
 
 class LowPassedCurrent(Current):
@@ -165,14 +156,11 @@ class SmoothedCurrent(Current):
 
     code, title = "smoothed_current", "digitally smoothed current"
     parameters = (Current.OFFSET, Parameter("current_smoothing", "1", 0.0, 200.0))
+    guesses = (0.5, 2.0, 8.0)
 
     def filtered(self, p: Values, motion: Motion, rows: Rows, scales: Scales) -> Array:
         """Return ``y += (i - y) / (1 + rows late)``."""
         return _smooth(rows.segment, motion.drive, p["current_smoothing"])
-
-    def starts(self, scales: Scales) -> Sequence[Mapping[str, float]]:
-        """Return delays of some rows."""
-        return [{"current_smoothing": n} for n in (0.5, 2.0, 8.0)]
 
 
 class UnsignedCurrent(Current):
@@ -189,15 +177,11 @@ class SupplyCurrent(MeanCurrent):
     """An ammeter at the supply of the bridge: the armature's current times the duty cycle."""
 
     code, title = "current_of_supply", "current of the supply"
-    parameters = (Current.OFFSET, Parameter("current_window", "row", 0.0, 100.0, typical=1.0))
+    guesses = (1.0,)
 
     def law(self, drive: Array, motion: Motion) -> Array:
         """Return power kept from the supply to the motor."""
         return drive * motion.duty
-
-    def starts(self, scales: Scales) -> Sequence[Mapping[str, float]]:
-        """Return means over a row."""
-        return [{"current_window": scales.step}]
 
 
 @compiled
