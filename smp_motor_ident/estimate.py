@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from typing import Any
 
 import numpy as np
 
@@ -16,17 +17,18 @@ from smp_motor_ident.fit.search import prune, search
 from smp_motor_ident.infer.answer import state_quantities
 from smp_motor_ident.infer.findings import EstimateContext, collect_findings, refuse_unexplained
 from smp_motor_ident.infer.levels import detect_levels
-from smp_motor_ident.infer.provenance import describe_candidates, describe_provenance
 from smp_motor_ident.infer.residuals import check_residuals
 from smp_motor_ident.infer.uncertainty import collect_contributions
 from smp_motor_ident.infer.validation import compute_fit_percents
 from smp_motor_ident.one_thread import one_thread
+from smp_motor_ident.quality.differenced import read_count_rounding
 from smp_motor_ident.quality.excitation import find_excitation
 from smp_motor_ident.quality.repair import repair_records
+from smp_motor_ident.quality.resolution import speed_quantum
 from smp_motor_ident.quality.screen import screen_records
 from smp_motor_ident.record import Record
 from smp_motor_ident.request import LOSSES, Request, check_request
-from smp_motor_ident.result import Estimate
+from smp_motor_ident.result import Candidate, Estimate
 
 
 def estimate(
@@ -142,3 +144,53 @@ def _report_left_out(refusal: SmpError) -> Finding:
         {},
         "record the armature's current with its sign, unfiltered",
     )
+
+
+def describe_provenance(context: EstimateContext) -> dict[str, Any]:
+    """Describe the records and the model of an `Estimate`, field by field."""
+    group, data = context.group, context.data
+    return {
+        "wheel": group[0].wheel,
+        "model": name_model(context),
+        "duration": float(sum(r.duration for r in group)),
+        "largest_voltage": max(float(np.abs(r.voltage).max()) for r in group),
+        "sources": tuple(dict.fromkeys(r.source for r in group if r.source)),
+        "hardware": group[0].hardware,
+        "samples": len(data),
+        "sample_time": data.rows.step,
+        "speed_noise": 0.0 if data.is_angle else float(context.found.noise[0].deviation[-1]),
+        "speed_step": _find_speed_step(context),
+        "angle_noise": _find_angle_noise(context),
+    }
+
+
+def name_model(context: EstimateContext) -> str:
+    """Return the structure of the motor that the data determine."""
+    if context.data.current is not None:
+        return "electromechanical"
+    if context.quantity("time_constant") is None:
+        return "static_gain"
+    return "first_order" if context.quantity("time_constant_product") is None else "second_order"
+
+
+def describe_candidates(context: EstimateContext) -> tuple[Candidate, ...]:
+    """Return the chosen chain."""
+    chosen = " + ".join(context.found.chain.codes)
+    return (Candidate(chosen, context.percent.estimation, context.found.deviance, True),)
+
+
+def _find_speed_step(context: EstimateContext) -> float:
+    """Return the largest step in which a recorded speed comes [rad/s]."""
+    if context.data.is_angle:
+        return 0.0
+    speeds = [r.velocity for r in context.group if r.velocity is not None]
+    return max(map(speed_quantum, speeds), default=0.0)
+
+
+def _find_angle_noise(context: EstimateContext) -> float:
+    """Return the noise of a recorded angle [rad], 0 where counts or a speed were recorded."""
+    group = context.group
+    counted = any(r.count is not None and r.hardware.counts_per_revolution for r in group)
+    if not context.data.is_angle or counted:
+        return 0.0
+    return max(map(read_count_rounding, group)) or float(context.found.noise[0].deviation[-1])

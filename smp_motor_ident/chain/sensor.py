@@ -124,7 +124,7 @@ class MeanCurrent(Current):
 
     code, title = "averaged_current", "averaged current"
     parameters = (Current.OFFSET, Parameter("current_window", "row", 0.0, 100.0, typical=1.0))
-    guesses = (0.6, 1.0, 3.0)
+    guesses: ClassVar[tuple[float, ...]] = (0.6, 1.0, 3.0)
     needs_charge = True
 
     def filtered(self, p: Values, motion: Motion, rows: Rows, scales: Scales) -> Array:

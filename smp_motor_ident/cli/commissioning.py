@@ -30,7 +30,7 @@ from smp_motor_ident.cli import (
 )
 from smp_motor_ident.cli.commissioning_log import CommissioningLog
 from smp_motor_ident.cli.processes import ProcessError, Processes, connect
-from smp_motor_ident.commission import validation_run, winding
+from smp_motor_ident.commission import recordings
 from smp_motor_ident.errors import ParameterError
 from smp_motor_ident.finding import Finding
 from smp_motor_ident.infer.validation import simulate
@@ -214,7 +214,7 @@ def find_hot_windings(
         f
         for w in now
         if w in before
-        for f in winding.report_heated_winding(w, before[w], now[w][0])
+        for f in recordings.report_heated_winding(w, before[w], now[w][0])
     ]
 
 
@@ -321,10 +321,10 @@ def validate_motors(
     read = {path: read_experiments([str(path)]) for path in (fitted, held_out)}
     for wheel, one in estimates.items():
         parts = [
-            [validation_run.SimulatedRun(r.time, *simulate(one, r)) for r in read[path][wheel]]
+            [recordings.SimulatedRun(r.time, *simulate(one, r)) for r in read[path][wheel]]
             for path in (fitted, held_out)
         ]
-        found.append(validation_run.judge(wheel, *parts))
+        found.append(recordings.judge(wheel, *parts))
     return found
 
 

@@ -26,10 +26,9 @@ from smp_motor_ident.tune import (
     specification,
     writing,
 )
-from smp_motor_ident.tune.case import Case, assess, prepare, solve
+from smp_motor_ident.tune.case import Case, Robustness, assess, prepare, solve
 from smp_motor_ident.tune.curves import Curves, curves
 from smp_motor_ident.tune.designer import finish
-from smp_motor_ident.tune.ensemble import Robustness
 from smp_motor_ident.tune.feedback import Feedback
 
 BANDWIDTH_SHARES = (0.3, 0.45, 0.65, 0.85, 1.0)

@@ -19,8 +19,7 @@ from smp_motor_ident.limits import (
     SETTLING_BAND,
 )
 from smp_motor_ident.result import Estimate
-from smp_motor_ident.tune.case import COMMON_TARGETS, Case, prepare, solve
-from smp_motor_ident.tune.ensemble import Robustness
+from smp_motor_ident.tune.case import COMMON_TARGETS, Case, Robustness, prepare, solve
 from smp_motor_ident.tune.feedback import Feedback
 from smp_motor_ident.tune.loop import Loop
 from smp_motor_ident.tune.margins import Margins, loop_margins

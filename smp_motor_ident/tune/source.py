@@ -12,9 +12,8 @@ from typing import Any
 
 from smp_motor_ident.errors import DesignError
 from smp_motor_ident.result import Estimate
-from smp_motor_ident.tune.case import Case, prepare, solve
+from smp_motor_ident.tune.case import Case, Robustness, prepare, solve
 from smp_motor_ident.tune.designer import settles
-from smp_motor_ident.tune.ensemble import Robustness
 from smp_motor_ident.tune.feedback import Feedback
 from smp_motor_ident.tune.loop import Loop
 

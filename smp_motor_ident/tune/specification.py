@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 from smp_motor_control.arrays import Array
 from smp_motor_control.wheel.plausibility import LOAD_SHARE
 from smp_motor_ident.limits import MAX_STATED_GAIN_MARGIN, MIN_OUTLIER_DEVIATIONS
-from smp_motor_ident.tune.case import Case
-from smp_motor_ident.tune.ensemble import REQUIRED_SHARE
+from smp_motor_ident.tune.case import REQUIRED_SHARE, Case
 from smp_motor_ident.tune.feedback import Feedback
 from smp_motor_ident.tune.loop import Loop
 from smp_motor_ident.tune.margins import BatchMargins, Margins

@@ -12,9 +12,8 @@ from smp_motor_control.reference.profile import Drive, Reference
 from smp_motor_control.reference.time_optimal import VoltageLimited
 from smp_motor_ident.errors import DesignError
 from smp_motor_ident.result import Estimate
-from smp_motor_ident.tune.case import Case, prepare, solve
+from smp_motor_ident.tune.case import Case, Robustness, back_off, prepare, solve
 from smp_motor_ident.tune.designer import Design, finish, with_reference
-from smp_motor_ident.tune.ensemble import Robustness, back_off
 from smp_motor_ident.tune.feedback import Feedback
 from smp_motor_ident.tune.loop import Loop
 

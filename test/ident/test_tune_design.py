@@ -11,7 +11,7 @@ from paper_motors import TABLE_1
 from smp_motor_ident.errors import DesignError
 from smp_motor_ident.result import Estimate, Quantity
 from smp_motor_ident.tune import METHODS, Loop, compare, design, design_wheels, recommend
-from smp_motor_ident.tune.ensemble import UncertaintyEnsemble
+from smp_motor_ident.tune.case import UncertaintyEnsemble
 from smp_motor_ident.tune.motors import draw_motors
 from smp_motor_ident.tune.plant import sample
 

@@ -8,7 +8,7 @@ import pytest
 from scipy.signal import cont2discrete, lfilter
 
 from smp_motor_ident.estimate import estimate
-from smp_motor_ident.infer.unmodelled import compute_relative_error
+from smp_motor_ident.infer.residuals import compute_relative_error
 from smp_motor_ident.record import Record
 from smp_motor_ident.report.document import identification_document, read_identification
 

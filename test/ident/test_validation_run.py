@@ -3,7 +3,7 @@
 
 import numpy as np
 
-from smp_motor_ident.commission.validation_run import SimulatedRun, judge
+from smp_motor_ident.commission.recordings import SimulatedRun, judge
 
 TIME = np.arange(0.0, 10.0, 0.005)
 SPEED = 100.0 * np.sin(2.0 * TIME)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from motors import simulate
 
-from smp_motor_ident.commission.winding import report_heated_winding, resistance
+from smp_motor_ident.commission.recordings import report_heated_winding, resistance
 from smp_motor_ident.record import Record
 
 R, L, K, J, B, TC = 3.2, 2e-3, 0.03, 1.4e-5, 5.5e-5, 2e-3
