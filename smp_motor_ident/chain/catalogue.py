@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from smp_motor_ident.chain import driver, force, motor, sensor
+from smp_motor_ident.chain import driver, motor, sensor
 from smp_motor_ident.chain.chain import Chain
 from smp_motor_ident.chain.component import Component
 from smp_motor_ident.result import ChainRecord
@@ -12,11 +12,11 @@ MOTORS: tuple[Component, ...] = (
     motor.FirstOrder(), motor.SecondOrder(), motor.Electromechanical(),
 )  # fmt: skip
 OPTIONAL: tuple[Component, ...] = (
-    motor.Friction(), motor.Load(), motor.Delay(), force.AsymmetricFriction(),
+    motor.Friction(), motor.Load(), motor.Delay(), motor.AsymmetricFriction(),
     driver.DeadZone(), driver.HardDeadZone(), driver.Clip(), driver.WeakSide(), driver.Slew(),
     driver.Sag(), driver.Drop(),
     driver.CurrentLimit(), driver.FastDecay(), driver.FreeAtZero(), driver.Decline(),
-    force.Drag(), force.Stribeck(), force.FrictionDrift(), force.LoadStep(),
+    motor.Drag(), motor.Stribeck(), motor.FrictionDrift(), motor.LoadStep(),
 )  # fmt: skip
 SPEED_SENSORS: tuple[Component, ...] = (sensor.MeanSpeed(), sensor.LowPassedSpeed())
 ANGLE_SENSORS: tuple[Component, ...] = (sensor.EccentricAngle(),)

@@ -66,15 +66,15 @@ class EstimateContext:
     tests: ResidualTests
     known: Mapping[str, float]
 
-    @property
-    def largest_command(self) -> float:
-        """Largest command [V]."""
-        return self.data.volts
-
     def quantity(self, name: str) -> Quantity | None:
         """Return a quantity that has a value."""
         found = self.answer.combinations.get(name) or self.answer.parameters.get(name)
         return found if found is not None and found.value is not None else None
+
+    def std(self, name: str) -> float:
+        """Return the standard deviation of a fitted parameter of the chain."""
+        k = self.found.names.index(name)
+        return math.sqrt(max(sum(float(part.covariance[k, k]) for part in self.parts), 0.0))
 
     @property
     def within_resolution(self) -> bool:
@@ -224,7 +224,7 @@ def _check_time_constant(context: EstimateContext) -> Iterator[Finding]:
 
 
 def _check_friction(context: EstimateContext) -> Iterator[Finding]:
-    static, most = context.quantity("static_voltage"), context.largest_command
+    static, most = context.quantity("static_voltage"), context.data.volts
     if static is None or (static.value or 0.0) <= MAX_STATIC_VOLTAGE_SHARE * most:
         return
     yield Finding(
@@ -269,10 +269,8 @@ def _is_significant(context: EstimateContext, one: Component) -> bool:
     """Tell whether some parameter of a component differs from that without effect."""
     for p in one.parameters:
         if p.name in context.found.names:
-            k = context.found.names.index(p.name)
-            variance = sum(float(part.covariance[k, k]) for part in context.parts)
             off = context.found.chain.values[p.name] - p.neutral * context.found.scales.of(p.unit)
-            if abs(off) > MIN_SIGNIFICANT_SIZE * math.sqrt(variance):
+            if abs(off) > MIN_SIGNIFICANT_SIZE * context.std(p.name):
                 return True
     return not any(p.name in context.found.names for p in one.parameters)
 
@@ -287,9 +285,8 @@ def _describe_size(context: EstimateContext, parameter: Parameter) -> str:
         name, unit = REPORTED[name], UNITS[REPORTED[name]]
         value, std = reported.value or 0.0, reported.std or 0.0
     else:
-        k, unit = context.found.names.index(name), parameter.unit
-        value = context.found.chain.values[name]
-        std = math.sqrt(max(sum(float(p.covariance[k, k]) for p in context.parts), 0.0))
+        unit, value = parameter.unit, context.found.chain.values[name]
+        std = context.std(name)
     shown = "" if unit == "1" else f" {unit}"
     return f"{name.replace('_', ' ')} {format_figure(value)} ± {format_figure(std, 2)}{shown}"
 
@@ -330,7 +327,7 @@ def _report_levels(context: EstimateContext) -> Iterator[Finding]:
         yield Finding(
             "one_direction", "warning",
             "the motor was driven in one direction: the static voltage includes a constant load",
-            {"voltage": levels.one_size or context.largest_command}, "drive both directions",
+            {"voltage": levels.one_size or context.data.volts}, "drive both directions",
         )  # fmt: skip
 
 
@@ -352,12 +349,10 @@ def _report_driving_load(context: EstimateContext) -> Iterator[Finding]:
 
 def _report_current_offset(context: EstimateContext) -> Iterator[Finding]:
     """Report the offset of the current sensor that was subtracted."""
-    names, current = context.found.names, context.data.current
-    if current is None or "current_offset" not in names:
+    current = context.data.current
+    if current is None or "current_offset" not in context.found.names:
         return
-    offset = context.found.chain.values["current_offset"]
-    k = names.index("current_offset")
-    std = math.sqrt(sum(p.covariance[k, k] for p in context.parts))
+    offset, std = context.found.chain.values["current_offset"], context.std("current_offset")
     if abs(offset) > max(4 * std, 0.01 * float(np.nanmax(np.abs(current)))):
         yield Finding(
             "current_offset", "note",

@@ -99,29 +99,25 @@ def back_off(
     Proportional and derivative action shrink with the factor, integral action with its square,
     so that the loop keeps its shape while its crossover moves down.
     """
-    found = assess(feedback)
-    if found.holds >= REQUIRED_SHARE:
-        return feedback, 1.0, found
-    good, bad = None, 1.0
-    factor = 0.97
-    while factor > 0.01:
+
+    def attempt(factor: float) -> tuple[Feedback, float, Robustness]:
         trial = reduce_crossover(feedback, factor)
-        found = assess(trial)
-        if found.holds >= REQUIRED_SHARE:
-            good = factor, trial, found
-            break
-        bad, factor = factor, factor * factor
-    if good is None:
-        return feedback, 0.0, assess(feedback)
-    for _ in range(6):
-        middle = 0.5 * (good[0] + bad)
-        trial = reduce_crossover(feedback, middle)
-        found = assess(trial)
-        if found.holds >= REQUIRED_SHARE:
-            good = middle, trial, found
+        return trial, factor, assess(trial)
+
+    whole = found = attempt(1.0)
+    bad = 1.0
+    while found[2].holds < REQUIRED_SHARE:
+        bad, factor = found[1], 0.97 if found is whole else found[1] * found[1]
+        if factor <= 0.01:
+            return feedback, 0.0, whole[2]
+        found = attempt(factor)
+    for _ in range(6 if found is not whole else 0):
+        closer = attempt(0.5 * (found[1] + bad))
+        if closer[2].holds >= REQUIRED_SHARE:
+            found = closer
         else:
-            bad = middle
-    return good[1], good[0], good[2]
+            bad = closer[1]
+    return found
 
 
 def reduce_crossover(feedback: Feedback, factor: float) -> Feedback:

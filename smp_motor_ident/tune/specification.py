@@ -233,15 +233,12 @@ def _measure_performance(
     push = Inputs(np.zeros(time.size), load=np.ones(time.size))
     loss = np.abs(simulate(problem.plant, alone, push).speed[0])
     return Performance(
-        rise=planned.rise,
-        settling=planned.settling,
-        overshoot=planned.overshoot,
+        **vars(planned),
         step_settling=abrupt.settling,
         step_overshoot=abrupt.overshoot,
         load_peak=float(loss.max()),
         load_integral=float(np.trapezoid(loss, time)),
         load_recovery=float(find_last_exit(time, loss > 0.1 * loss.max())),
-        peak_voltage=planned.peak_voltage,
         control_noise=control_noise,
     )
 
