@@ -34,8 +34,7 @@ from smp_motor_control.motor.parameters import MotorParameters
 from smp_motor_ident.estimate import estimate
 from smp_motor_ident.record import Hardware, Record
 from smp_motor_ident.tune import Loop, design_wheels
-from smp_motor_ident.tune.feedback import Feedback, spectral_radius
-from smp_motor_ident.tune.margins import loop_margins
+from smp_motor_ident.tune.feedback import Feedback, loop_margins, spectral_radius
 from smp_motor_ident.tune.motors import Motors
 from smp_motor_ident.tune.plant import sample
 

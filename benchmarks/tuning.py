@@ -39,8 +39,7 @@ from closed_loop import (
 from smp_motor_ident.errors import DesignError
 from smp_motor_ident.result import Estimate, Quantity
 from smp_motor_ident.tune import METHODS, Design, Loop, design
-from smp_motor_ident.tune.feedback import Feedback, spectral_radius
-from smp_motor_ident.tune.margins import batch_margins, make_grid
+from smp_motor_ident.tune.feedback import Feedback, batch_margins, make_grid, spectral_radius
 from smp_motor_ident.tune.motors import draw_motors, make_motors
 from smp_motor_ident.tune.plant import sample
 from smp_motor_ident.tune.problem import Problem

@@ -14,12 +14,16 @@ from smp_motor_control.fields import check_limits, described, nested, optional
 from smp_motor_control.motor.parameters import Gearbox, MotorModel
 from smp_motor_control.observer import ObserverNoise, SpeedObserver
 from smp_motor_control.pid import Pid, PidGains, PidOutput
-from smp_motor_control.reference.path import ReferencePath
-from smp_motor_control.reference.profile import Drive, Profile, ProfileLimits, Reference
+from smp_motor_control.reference.profile import (
+    Drive,
+    Profile,
+    ProfileLimits,
+    Reference,
+    ReferencePath,
+)
 from smp_motor_control.wheel.differenced import differenced_gains
 from smp_motor_control.wheel.plausibility import PlausibleSpeed
-from smp_motor_control.wheel.standstill import Standstill
-from smp_motor_control.wheel.stop import MAX_STOP_TIME_S
+from smp_motor_control.wheel.stop import MAX_STOP_TIME_S, Standstill
 
 SPEED_SOURCES = ("measured", "difference", "observer")
 

@@ -15,9 +15,14 @@ from smp_motor_ident.chain.terminal import Driver, apply_driver, make_driver
 from smp_motor_ident.errors import DesignError
 from smp_motor_ident.finding import Finding
 from smp_motor_ident.result import Estimate
-from smp_motor_ident.tune.feedback import Feedback, spectral_radius
+from smp_motor_ident.tune.feedback import (
+    BatchMargins,
+    Feedback,
+    batch_margins,
+    make_grid,
+    spectral_radius,
+)
 from smp_motor_ident.tune.loop import Loop
-from smp_motor_ident.tune.margins import BatchMargins, batch_margins, make_grid
 from smp_motor_ident.tune.methods import METHODS
 from smp_motor_ident.tune.motors import (
     Friction,

@@ -9,7 +9,7 @@ import numpy as np
 from smp_motor_control.arrays import Array
 from smp_motor_ident.result import Estimate
 from smp_motor_ident.tune.designer import Design
-from smp_motor_ident.tune.margins import frequencies
+from smp_motor_ident.tune.feedback import frequencies
 from smp_motor_ident.tune.motors import draw_motors, make_motors
 from smp_motor_ident.tune.plant import sample
 from smp_motor_ident.tune.problem import noise_density

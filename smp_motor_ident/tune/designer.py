@@ -20,9 +20,8 @@ from smp_motor_ident.limits import (
 )
 from smp_motor_ident.result import Estimate
 from smp_motor_ident.tune.case import COMMON_TARGETS, Case, Robustness, prepare, solve
-from smp_motor_ident.tune.feedback import Feedback
+from smp_motor_ident.tune.feedback import Feedback, Margins, loop_margins
 from smp_motor_ident.tune.loop import Loop
-from smp_motor_ident.tune.margins import Margins, loop_margins
 from smp_motor_ident.tune.methods import METHODS
 from smp_motor_ident.tune.motors import Motors, move_lag_to_sensor
 from smp_motor_ident.tune.plant import Plant, sample

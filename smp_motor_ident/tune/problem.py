@@ -11,9 +11,8 @@ import numpy as np
 
 from smp_motor_control.arrays import Array, Complex
 from smp_motor_ident.errors import DesignError
-from smp_motor_ident.tune.feedback import Feedback
+from smp_motor_ident.tune.feedback import Feedback, make_grid
 from smp_motor_ident.tune.loop import Loop
-from smp_motor_ident.tune.margins import make_grid
 from smp_motor_ident.tune.plant import Plant
 from smp_motor_ident.tune.unmodelled import UnmodelledDynamics
 

@@ -12,9 +12,8 @@ from smp_motor_control.arrays import Array
 from smp_motor_control.wheel.plausibility import LOAD_SHARE
 from smp_motor_ident.limits import MAX_STATED_GAIN_MARGIN, MIN_OUTLIER_DEVIATIONS
 from smp_motor_ident.tune.case import REQUIRED_SHARE, Case
-from smp_motor_ident.tune.feedback import Feedback
+from smp_motor_ident.tune.feedback import BatchMargins, Feedback, Margins
 from smp_motor_ident.tune.loop import Loop
-from smp_motor_ident.tune.margins import BatchMargins, Margins
 from smp_motor_ident.tune.plant import Plant, sample
 from smp_motor_ident.tune.problem import Problem
 from smp_motor_ident.tune.reference import STEP_SHARE, Change, Reference, planned_change

@@ -25,12 +25,17 @@ from smp_motor_control.motor.parameters import Gearbox, MotorModel
 from smp_motor_control.observer import ObserverNoise
 from smp_motor_control.pid import PidGains
 from smp_motor_control.reference.profile import Drive, ProfileLimits
-from smp_motor_control.wheel import standstill
+from smp_motor_control.wheel import stop
 from smp_motor_control.wheel.acceptance import OperatingConditions, check
 from smp_motor_control.wheel.controller import State, WheelSettings
 from smp_motor_control.wheel.loop import LoopSettings, WheelLoop
-from smp_motor_control.wheel.standstill import STANDSTILL_TIME_S, Standstill
-from smp_motor_control.wheel.stop import AVERAGING_WINDOW_S, REST_SPEED, STANDSTILL_SETPOINT
+from smp_motor_control.wheel.stop import (
+    AVERAGING_WINDOW_S,
+    REST_SPEED,
+    STANDSTILL_SETPOINT,
+    STANDSTILL_TIME_S,
+    Standstill,
+)
 
 MODEL = MotorModel(dc_gain=GAIN * 65.5, time_constant=TAU)
 KNOWN = OperatingConditions(sample_time=DT, supply=SUPPLY, gearbox=Gearbox(65.5))
@@ -297,7 +302,7 @@ def stop_profile(seed: int) -> np.ndarray:
 def test_voltage_is_constant_at_standstill_despite_one_count_flicker(monkeypatch):
     ends = [simulate(stop_profile(seed))[0][-1_000:] for seed in range(6)]
     assert max(np.ptp(end) for end in ends) < 1e-9  # from a second after the stop
-    monkeypatch.setattr(standstill, "STANDSTILL_TIME_S", math.inf)
+    monkeypatch.setattr(stop, "STANDSTILL_TIME_S", math.inf)
     ends = [simulate(stop_profile(seed))[0][-1_000:] for seed in range(6)]
     assert max(np.ptp(end) for end in ends) > 0.2  # [V], without the rule
 

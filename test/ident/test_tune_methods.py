@@ -8,9 +8,8 @@ import pytest
 
 from smp_motor_ident.cli.relaying import read_oscillation, resample_evenly
 from smp_motor_ident.errors import DesignError
-from smp_motor_ident.tune.feedback import Feedback, closed_loop
+from smp_motor_ident.tune.feedback import Feedback, closed_loop, loop_margins
 from smp_motor_ident.tune.loop import Loop
-from smp_motor_ident.tune.margins import loop_margins
 from smp_motor_ident.tune.methods import METHODS
 from smp_motor_ident.tune.methods.margin import scale_to_sensitivity
 from smp_motor_ident.tune.methods.rules import apply_rule

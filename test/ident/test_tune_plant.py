@@ -10,9 +10,15 @@ from scipy.integrate import solve_ivp
 
 from smp_motor_control.pid import Pid, PidGains
 from smp_motor_control.reference.minimum_jerk import MinimumJerk, Reference
-from smp_motor_ident.tune.feedback import Feedback, closed_loop, spectral_radius
+from smp_motor_ident.tune.feedback import (
+    Feedback,
+    batch_margins,
+    closed_loop,
+    loop_margins,
+    make_grid,
+    spectral_radius,
+)
 from smp_motor_ident.tune.loop import Loop
-from smp_motor_ident.tune.margins import batch_margins, loop_margins, make_grid
 from smp_motor_ident.tune.motors import Motors
 from smp_motor_ident.tune.plant import sample
 from smp_motor_ident.tune.simulation import Controller, Inputs, simulate

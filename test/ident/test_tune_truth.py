@@ -15,8 +15,7 @@ from smp_motor_ident.finding import Finding
 from smp_motor_ident.report.document import identification_document
 from smp_motor_ident.result import ChainRecord, Estimate, Quantity, Share, Systematic
 from smp_motor_ident.tune import design
-from smp_motor_ident.tune.feedback import Feedback, spectral_radius
-from smp_motor_ident.tune.margins import batch_margins, loop_margins
+from smp_motor_ident.tune.feedback import Feedback, batch_margins, loop_margins, spectral_radius
 from smp_motor_ident.tune.motors import bound_friction, make_motors
 from smp_motor_ident.tune.plant import sample
 from smp_motor_ident.tune.problem import Problem

@@ -3,7 +3,7 @@
 
 from pathlib import Path
 
-from smp_motor_ident.bag.readers import csv, json, mat, mcap, ros1, sqlite, wpilog, xlsx
+from smp_motor_ident.bag.readers import apart, csv, json, mcap, ros1, sqlite, wpilog
 from smp_motor_ident.bag.readers.format import Format, Messages, Tables
 from smp_motor_ident.bag.storage import note_damage
 from smp_motor_ident.bag.unpack import MAGIC, Budget, unpack_file
@@ -11,8 +11,8 @@ from smp_motor_ident.errors import BagError
 
 FORMATS: tuple[Format, ...] = (
     *(mcap.FORMAT, sqlite.FORMAT, ros1.FORMAT, wpilog.FORMAT),
-    *(mat.FORMAT_4, mat.FORMAT_5, mat.FORMAT_73),
-    *(xlsx.FORMAT, json.FORMAT, csv.FORMAT),
+    *(apart.MATLAB_4, apart.MATLAB_5, apart.MATLAB_73),
+    *(apart.EXCEL, json.FORMAT, csv.FORMAT),
 )
 BAGS = tuple(s for f in FORMATS if not f.tables for s in f.suffixes)
 TABLES = tuple(s for f in FORMATS if f.tables for s in f.suffixes)

@@ -10,10 +10,9 @@ import numpy as np
 from smp_motor_ident.errors import DesignError
 from smp_motor_ident.limits import SETTLING_BAND
 from smp_motor_ident.tune.designer import Design
-from smp_motor_ident.tune.feedback import Feedback
+from smp_motor_ident.tune.feedback import Feedback, Margins, loop_margins
 from smp_motor_ident.tune.known_loop import KnownLoop
 from smp_motor_ident.tune.loop import Loop
-from smp_motor_ident.tune.margins import Margins, loop_margins
 from smp_motor_ident.tune.reference import STEP_SHARE
 from smp_motor_ident.tune.simulation import Controller, Inputs, StepFigures, simulate, step_figures
 

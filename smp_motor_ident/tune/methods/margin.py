@@ -19,8 +19,7 @@ import numpy as np
 from smp_motor_control.arrays import Array
 from smp_motor_ident.errors import DesignError
 from smp_motor_ident.limits import MAX_SPEED_NOISE
-from smp_motor_ident.tune.feedback import Feedback, spectral_radius, terms
-from smp_motor_ident.tune.margins import loop_margins
+from smp_motor_ident.tune.feedback import Feedback, loop_margins, spectral_radius, terms
 from smp_motor_ident.tune.methods.rules import SIMC
 from smp_motor_ident.tune.problem import Method, Problem, RequiredMargins
 from smp_motor_ident.tune.unmodelled import describe_known_band
