@@ -5,7 +5,7 @@ import importlib
 import os
 import signal
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from types import FrameType
 
 # One thread for linear algebra: with two, OpenBLAS waits in a busy loop, which under SCHED_FIFO
@@ -102,6 +102,18 @@ def find_domain_problem() -> str:
     if domain.isdecimal() and int(domain) <= MAX_DOMAIN_ID:
         return ""
     return f"ROS_DOMAIN_ID is {domain!r}; it must be a whole number from 0 to {MAX_DOMAIN_ID}"
+
+
+def split_arguments(argv: Sequence[str]) -> tuple[list[str], list[str]]:
+    """Return a program's own arguments and those from ``--ros-args`` to ``--``."""
+    own: list[str] = []
+    ros: list[str] = []
+    inside = False
+    for argument in argv:
+        inside = inside or argument == "--ros-args"
+        (ros if inside else own).append(argument)
+        inside = inside and argument != "--"
+    return own, ros
 
 
 wheel_pid = node("wheel_pid")

@@ -4,6 +4,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import AbstractContextManager, nullcontext
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -20,7 +22,6 @@ from smp_motor_ident.infer.levels import detect_levels
 from smp_motor_ident.infer.residuals import check_residuals
 from smp_motor_ident.infer.uncertainty import collect_contributions
 from smp_motor_ident.infer.validation import compute_fit_percents
-from smp_motor_ident.one_thread import one_thread
 from smp_motor_ident.quality.differenced import read_count_rounding
 from smp_motor_ident.quality.excitation import find_excitation
 from smp_motor_ident.quality.repair import repair_records
@@ -194,3 +195,22 @@ def _find_angle_noise(context: EstimateContext) -> float:
     if not context.data.is_angle or counted:
         return 0.0
     return max(map(read_count_rounding, group)) or float(context.found.noise[0].deviation[-1])
+
+
+def one_thread() -> AbstractContextManager[object]:
+    """Return a context in which the linear algebra library runs on one thread.
+
+    The tools set this before they import numpy; a program that imports numpy first needs this.
+    """
+    pools = _pools()
+    return nullcontext() if pools is None else pools.limit(limits=1)
+
+
+@cache
+def _pools() -> Any:
+    """Return the libraries' threads; None without threadpoolctl, which apt's numpy does without."""
+    try:
+        from threadpoolctl import ThreadpoolController
+    except ImportError:
+        return None
+    return ThreadpoolController()

@@ -26,9 +26,9 @@ from printed import agree, not_printed
 from recordings import COUNTS, RATIO, START, Motion, floats, in_order, joint_state
 
 from smp_motor_control import WHEELS
+from smp_motor_control.entry import split_arguments
 from smp_motor_control.motor import Motor
 from smp_motor_control.motor.file import load_motors
-from smp_motor_control.ros_arguments import split_arguments
 from smp_motor_control.serial_protocol import decode_state, encode_age, encode_voltages
 from smp_motor_ident.cli import commission, demo, identify, lab, tune
 from smp_motor_ident.nodes import play, record

@@ -4,7 +4,7 @@
 from dataclasses import dataclass
 
 from smp_motor_control import LEFT, RIGHT, check_wheel_names
-from smp_motor_control.body.heading import HeadingHold
+from smp_motor_control.body.command import HeadingHold
 from smp_motor_control.body.kinematics import SkidSteer
 from smp_motor_control.body.speed_limiter import SpeedLimiter
 from smp_motor_control.errors import ParameterError

@@ -15,8 +15,8 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any, NoReturn
 
+from smp_motor_control.entry import split_arguments
 from smp_motor_control.errors import SmpError
-from smp_motor_control.ros_arguments import split_arguments
 from smp_motor_ident.cli.interruption import check, interruptible
 
 INTERRUPTED = 130  # exit code after Ctrl-C, as shells have it

@@ -14,9 +14,9 @@ from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rosgraph_msgs.msg import Clock
 
+from smp_motor_control.entry import split_arguments
 from smp_motor_control.errors import SmpError
 from smp_motor_control.nodes import runtime
-from smp_motor_control.ros_arguments import split_arguments
 from smp_motor_ident.bag.replay import Replay, find_offered_qos
 from smp_motor_ident.bag.storage import Channel
 from smp_motor_ident.nodes.bag_arguments import message_class, quality

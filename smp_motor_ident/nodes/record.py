@@ -21,6 +21,7 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.subscription import Subscription
 from rclpy.topic_endpoint_info import TopicEndpointInfo
 
+from smp_motor_control.entry import split_arguments
 from smp_motor_control.errors import SmpError
 from smp_motor_control.nodes import executor, runtime
 from smp_motor_control.nodes.publishers import (
@@ -28,7 +29,6 @@ from smp_motor_control.nodes.publishers import (
     are_publishers_known,
     describe_two_publishers,
 )
-from smp_motor_control.ros_arguments import split_arguments
 from smp_motor_ident.bag.writer import DEFAULT_QOS, BagWriter
 from smp_motor_ident.nodes.bag_arguments import message_class, quality
 

@@ -147,13 +147,7 @@ def finish(
         specification=bands,
         reference=reference,
         plant=plant,
-        motor={
-            "dc_gain": 1 / float(m.a0[0]),
-            "time_constant": float(m.a1[0] / m.a0[0]),
-            "time_constant_product": float(m.a2[0] / m.a0[0]),
-            "static_voltage": case.friction.known,
-            "delay": float(m.delay[0]),
-        },
+        motor={**m.combine(), "static_voltage": case.friction.known},
         sensor={
             "averaging_window": float(m.averaging_window[0]),
             "sensor_lag": float(m.sensor_lag[0]),

@@ -40,6 +40,13 @@ class Motors:
         """Return the number of motors."""
         return int(self.a0.size)
 
+    def combine(self, k: int = 0) -> dict[str, float]:
+        """Return the combinations and the delay of one motor."""
+        shape, by = self.a0.shape, self.a0
+        values = 1 / by, self.a1 / by, self.a2 / by, self.static_voltage, self.delay
+        each = (float(np.broadcast_to(value, shape)[k]) for value in values)
+        return dict(zip((*COMBINATIONS, "delay"), each))
+
     def first(self, n: int) -> "Motors":
         """Return the first ``n`` motors of the batch."""
         return Motors(**{each.name: getattr(self, each.name)[:n] for each in fields(self)})

@@ -227,13 +227,7 @@ def _average(window: Array, tail: Array, T: float) -> Array:
 
 def _observer(believed: Motors, loop: Loop) -> ObserverModel:
     """Return the steady-state observer that runs with the first of some motors as its model."""
-    a0, a1, a2 = (float(a[0]) for a in (believed.a0, believed.a1, believed.a2))
-    model = MotorModel(
-        dc_gain=1 / a0,
-        time_constant=a1 / a0,
-        time_constant_product=a2 / a0,
-        delay=float(believed.delay[0]),
-    )
+    model = MotorModel(**believed.combine())
     sample_time = loop.sample_time
     *gain, variance = steady_gain(model, loop.count_angle, ObserverNoise(), sample_time)
     correct = np.array(gain)

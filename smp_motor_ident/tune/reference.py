@@ -211,13 +211,11 @@ def _find_shortest(
     linear = replace(controller, limit=math.inf, tracking=math.inf)
     grain = max(0.002, loop.sample_time)
     grains = math.ceil(max(0.01, least) / grain)
-    while True:
+    while grains * grain <= MAX_TRANSITION_S:
         plan = replace(plan, transition_time=round(grains * grain, 9))
         if all(_measure_overshoot(led, one, linear, plan) <= most for led, one, most in trials):
             return plan
         grains += max(1, grains // 16)
-        if grains * grain > MAX_TRANSITION_S:
-            break
     raise DesignError(
         f"every change of set-point shorter than {MAX_TRANSITION_S:g} s overshoots; ask for a "
         "larger phase_margin"

@@ -52,20 +52,17 @@ class Inputs:
     # low, high: [rad/s]: without error between them; without ``high``, ``low`` is the reference
     low: Array
     high: Array | None = None
-    forward: Array | None = None  # [V]: Feed-forward
-    load: Array | None = None  # [V]: of a load, shape (k,) or (n, k)
-    noise: Array | None = None  # [rad/s]: on the measured speed, shape (n, k)
-    angle_noise: Array | None = None  # [rad]: on the angle that it is made from, shape (n, k)
+    forward: Array | float = 0.0  # [V]: Feed-forward
+    load: Array | float = 0.0  # [V]: of a load, shape (k,) or (n, k)
+    noise: Array | float = 0.0  # [rad/s]: on the measured speed, shape (n, k)
+    angle_noise: Array | float = 0.0  # [rad]: on the angle that it is made from, shape (n, k)
 
 
-def draw_white_noise(
-    deviation: float, shape: tuple[int, int], seed: int = 0, of: NDArray[np.bool_] | None = None
-) -> Array | None:
-    """Return reproducible white noise ``of`` some motors or all; None without noise."""
+def draw_white_noise(deviation: float, shape: tuple[int, int], seed: int = 0) -> Array:
+    """Return reproducible white noise."""
     if deviation == 0.0:
-        return None
-    noise = np.asarray(deviation * np.random.default_rng(seed).standard_normal(shape))
-    return noise if of is None else noise * of[:, None]
+        return np.zeros(shape)
+    return np.asarray(deviation * np.random.default_rng(seed).standard_normal(shape))
 
 
 def simulate(
@@ -89,10 +86,11 @@ def simulate(
     n, steps, fb = len(plant), inputs.low.size, controller.feedback
     numbers = (fb.p, fb.i, fb.d, fb.filter_time, controller.weight, controller.weight_d,
                controller.limit, 1.0 / controller.tracking)  # fmt: skip
-    observer, none = plant.observer or NO_OBSERVER, np.zeros(steps)
-    still = np.broadcast_to(0.0, (n, steps))
-    noise = still if inputs.noise is None else inputs.noise
-    of_angle = still if inputs.angle_noise is None else inputs.angle_noise
+    observer = plant.observer or NO_OBSERVER
+    load, noise, of_angle = (
+        np.broadcast_to(signal, (n, steps))
+        for signal in (inputs.load, inputs.noise, inputs.angle_noise)
+    )
     found = _run(
         (plant.phi, plant.taps, plant.phi_angle, plant.taps_angle), plant.sample_time, plant.sensor,
         plant.average,
@@ -101,8 +99,7 @@ def simulate(
         np.array(numbers, dtype=np.float64),
         np.asarray(inputs.low, dtype=np.float64),
         np.asarray(inputs.low if inputs.high is None else inputs.high, dtype=np.float64),
-        none if inputs.forward is None else inputs.forward,
-        still if inputs.load is None else np.broadcast_to(inputs.load, (n, steps)),
+        np.ascontiguousarray(np.broadcast_to(inputs.forward, steps)), load,
         np.zeros(n) if friction is None else np.ascontiguousarray(friction),
         modelled, np.full(n, count_angle), speed_step, np.full(n, eccentric),
         np.ascontiguousarray(noise), np.ascontiguousarray(of_angle), driver.numbers, driver.lane,

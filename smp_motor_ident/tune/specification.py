@@ -159,7 +159,7 @@ def _simulate_ensemble(
             + late * np.diff(forward, prepend=forward[0]),
             noise=_draw_noise(case, loop, shape)
             + late * np.diff(plan.reference, prepend=plan.reference[0]),
-            angle_noise=draw_white_noise(loop.angle_noise, shape, of=counted),
+            angle_noise=draw_white_noise(loop.angle_noise, shape) * counted[:, None],
         ),
         count_angle=np.where(counted, loop.count_angle, 0.0),
         speed_step=loop.rounding,
@@ -197,20 +197,20 @@ def _draw_loads(case: Case, friction: Array, shape: tuple[int, int]) -> Array:
     end.
     """
     either = np.where(np.arange(shape[0]) // 2 % 2, -1.0, 1.0)
-    noise = draw_white_noise(case.torque_noise, shape, 1)
-    held: Array = np.broadcast_to((either * np.minimum(case.load, friction))[:, None], shape)
-    return held if noise is None else held + noise
+    held: Array = (either * np.minimum(case.load, friction))[:, None]
+    return held + draw_white_noise(case.torque_noise, shape, 1)
 
 
-def _draw_noise(case: Case, loop: Loop, shape: tuple[int, int]) -> Array | float:
+def _draw_noise(case: Case, loop: Loop, shape: tuple[int, int]) -> Array:
     """Return the noise of the reported speed, with the outliers that the running loop believes.
 
     They have any size up to the top speed; the loop rejects changes impossible for a motor.
     """
     rounding = loop.rounding**2 / 12
-    noise = draw_white_noise(math.sqrt(max(loop.reported_noise**2 - rounding, 0.0)), shape)
-    if noise is None or not case.outliers:
-        return 0.0 if noise is None else noise
+    deviation = math.sqrt(max(loop.reported_noise**2 - rounding, 0.0))
+    noise = draw_white_noise(deviation, shape)
+    if not (deviation and case.outliers):
+        return noise
     motor = case.problem.plant.motors
     top = loop.supply_voltage / float(motor.a0[0])
     load = LOAD_SHARE * loop.supply_voltage + case.lost_voltage

@@ -19,7 +19,7 @@ from smp_motor_control.encoder import Encoder
 from smp_motor_control.fields import build_settings, parameters_in
 from smp_motor_control.motor.file import MotorEntry
 from smp_motor_control.motor.hardware import DrivenMotor, DriveSettings
-from smp_motor_control.motor.parameters import COMBINATIONS, Gearbox, MotorParameters
+from smp_motor_control.motor.parameters import Gearbox, MotorParameters
 from smp_motor_control.parameter_file import flatten
 from smp_motor_control.wheel.loop import LoopSettings, WheelLoop
 from smp_motor_ident.finding import Finding
@@ -312,11 +312,9 @@ def _draw_entries(estimate: Estimate, supply: float) -> list[MotorEntry]:
     encoder = Encoder(hardware.counts_per_revolution or 1e6, 0)
     entries = []
     for batch in (nominal, *([nominal] * DRAWS if drawn is None else [drawn])):
-        rows = np.broadcast_arrays(
-            1 / batch.a0, batch.a1 / batch.a0, batch.a2 / batch.a0, batch.static_voltage
-        )
-        delays = np.broadcast_to(batch.delay, rows[0].shape)
-        for combined, delay in zip(np.transpose(rows).tolist(), delays.tolist()):
-            motor = MotorParameters.from_combinations(**dict(zip(COMBINATIONS, combined)))
+        for k in range(len(batch)):
+            combined = batch.combine(k)
+            delay = combined.pop("delay")
+            motor = MotorParameters.from_combinations(**combined)
             entries.append(MotorEntry(motor, gearbox, encoder, supply, delay))
     return entries

@@ -10,8 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from smp_motor_control import LEFT, RIGHT, get_joint_name
+from smp_motor_control.body.command import HeadingHold
 from smp_motor_control.body.description import robot_description
-from smp_motor_control.body.heading import HeadingHold
 from smp_motor_control.body.kinematics import SkidSteer
 from smp_motor_control.body.odometry import Odometry
 from smp_motor_control.body.speed_limiter import SpeedLimiter
