@@ -2,6 +2,7 @@
 """Install rules: an ament_python package for colcon, and a Python package for pip."""
 
 import os
+import shutil
 import subprocess
 import sys
 from glob import glob
@@ -71,27 +72,25 @@ def find_files(pattern: str) -> list[str]:
     return [name for name in glob(pattern, recursive=True) if os.path.isfile(name)]
 
 
-def prefixes() -> list[Path]:
-    """Return the install prefixes of the sourced workspaces."""
-    named = os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep)
-    return [Path(prefix) for prefix in named if prefix]
-
-
 def build_messages(build_base: Path) -> None:
     """Build `smp_interfaces` into this package's prefix, unless another prefix has it.
 
     colcon looks for no package below a folder that holds a package.xml.
     """
     prefix = Path(sys.prefix)  # colcon's, while it runs this file
-    if any((p / "share/smp_interfaces/package.xml").is_file() for p in prefixes() if p != prefix):
+    sourced = os.environ.get("AMENT_PREFIX_PATH", "")
+    others = {Path(place) for place in sourced.split(os.pathsep) if place} - {prefix}
+    if any((other / "share/smp_interfaces/package.xml").is_file() for other in others):
         return
+    if shutil.which("cmake") is None:
+        raise SystemExit("smp_interfaces needs cmake: apt install cmake")
     python_path = os.environ.get("PYTHONPATH", "").split(os.pathsep)
     own = ("prefix_override", "colcon_distutils_commands")  # colcon's, for setuptools alone
     env = {
         **os.environ,
         "PYTHONPATH": os.pathsep.join(p for p in python_path if Path(p).name not in own),
         "CMAKE_PREFIX_PATH": os.pathsep.join(
-            filter(None, [os.environ.get("CMAKE_PREFIX_PATH"), *map(str, prefixes())])
+            filter(None, [os.environ.get("CMAKE_PREFIX_PATH"), sourced])
         ),
     }
     folder = build_base / "smp_interfaces"
@@ -105,10 +104,7 @@ def build_messages(build_base: Path) -> None:
         ["cmake", "--build", str(folder), "--parallel", str(os.cpu_count() or 1)],
         ["cmake", "--install", str(folder)],
     ):
-        try:
-            done = subprocess.run(command, env=env, capture_output=True, text=True, check=False)
-        except FileNotFoundError:
-            raise SystemExit("smp_interfaces needs cmake: apt install cmake") from None
+        done = subprocess.run(command, env=env, capture_output=True, text=True, check=False)
         if done.returncode:
             print(done.stdout, done.stderr, sep="\n")
             raise SystemExit(

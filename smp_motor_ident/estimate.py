@@ -18,9 +18,8 @@ from smp_motor_ident.fit.descend import Fit, constrain, evaluate_on_rows, fit, r
 from smp_motor_ident.fit.search import prune, search
 from smp_motor_ident.infer.answer import state_quantities
 from smp_motor_ident.infer.findings import EstimateContext, collect_findings, refuse_unexplained
-from smp_motor_ident.infer.levels import detect_levels
 from smp_motor_ident.infer.residuals import check_residuals
-from smp_motor_ident.infer.uncertainty import collect_contributions
+from smp_motor_ident.infer.uncertainty import collect_contributions, detect_levels
 from smp_motor_ident.infer.validation import compute_fit_percents
 from smp_motor_ident.quality.differenced import read_count_rounding
 from smp_motor_ident.quality.excitation import find_excitation

@@ -167,11 +167,8 @@ class Stribeck(Component):
 class FrictionDrift(Component):
     """Friction that changes by a share over the recording."""
 
-    code, slot, title = (
-        "friction_drift",
-        "friction_drift",
-        "friction that changes during the recording",
-    )
+    code = slot = "friction_drift"
+    title = "friction that changes during the recording"
     advice = "let the gearbox warm up before recording"
     linear = "friction_drift"
     parameters = (Parameter("friction_drift", "1", -0.95, 3.0, typical=0.1),)

@@ -20,8 +20,7 @@ from smp_motor_ident.chain.catalogue import find_component
 from smp_motor_ident.chain.quantities import HIDDEN, jacobian
 from smp_motor_ident.fit.data import Data
 from smp_motor_ident.fit.descend import Fit
-from smp_motor_ident.infer.levels import Levels
-from smp_motor_ident.infer.uncertainty import DRIVER_SLOTS, Contribution
+from smp_motor_ident.infer.uncertainty import DRIVER_SLOTS, Contribution, Levels
 from smp_motor_ident.limits import CURRENT_ACCURACY, MAX_RELATIVE_STD, ONE_SIZE_ACCURACY
 from smp_motor_ident.record import Hardware
 from smp_motor_ident.result import NORMAL_95, UNITS, Quantity, Share, Systematic

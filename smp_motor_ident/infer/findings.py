@@ -20,8 +20,7 @@ from smp_motor_ident.fit.data import Data, prepare
 from smp_motor_ident.fit.descend import Fit, approach, fit
 from smp_motor_ident.fit.start import guess_motors
 from smp_motor_ident.infer.answer import SCALE_POWERS, Answer
-from smp_motor_ident.infer.levels import Levels
-from smp_motor_ident.infer.uncertainty import Contribution
+from smp_motor_ident.infer.uncertainty import Contribution, Levels
 from smp_motor_ident.infer.validation import compute_explained_percent, estimate_white_share
 from smp_motor_ident.limits import MAX_STATIC_VOLTAGE_SHARE
 from smp_motor_ident.quality.screen import name_records

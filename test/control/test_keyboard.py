@@ -4,7 +4,7 @@
 import pytest
 
 from smp_motor_control import WHEELS
-from smp_motor_control.keyboard import BODY_KEYS, Keyboard, Speeds, parse_keys
+from smp_motor_control.nodes.teleop_wheels import BODY_KEYS, Keyboard, Speeds, parse_keys
 
 SPEEDS = Speeds(linear=0.2, angular=0.6, wheel=1.5, step=0.1, timeout=0.6)
 

@@ -13,11 +13,11 @@ from smp_motor_control.body.kinematics import SkidSteer
 from smp_motor_control.body.odometry import Odometry
 from smp_motor_control.encoder import Encoder
 from smp_motor_control.errors import ParameterError
-from smp_motor_control.keyboard import Speeds
 from smp_motor_control.motor import MotorParameters
 from smp_motor_control.motor.file import load_motors
 from smp_motor_control.motor.hardware import DriveSettings
 from smp_motor_control.motor.parameters import MotorModel
+from smp_motor_control.nodes.teleop_wheels import Speeds
 from smp_motor_control.observer import ObserverNoise
 from smp_motor_control.pid import PidGains
 from smp_motor_control.reference.profile import ProfileLimits
