@@ -75,13 +75,7 @@ class Wheel:
 
     def __init__(self, node: Node, name: str, settings: Settings) -> None:
         self.settings, self.voltage, self.commanded = settings, 0.0, -math.inf
-        names = (
-            "gear_ratio",
-            "counts_per_revolution",
-            "encoder_bits",
-            "supply_voltage",
-            "resistance",
-        )
+        names = set(MotorDescription.get_fields_and_field_types()) - {"joint_name"}
         description = MotorDescription(**{name: getattr(settings, name) for name in names})
         timeout = settings.command_timeout
         self._driver = MotorDriver(node, name, timeout, self._on_command, description)

@@ -217,14 +217,13 @@ def prepare(estimate: Estimate, loop: Loop, method: str, targets: dict[str, Any]
     if motors is None:
         words = "the estimate has no uncertainty: the margins are those of one motor"
         findings.append(Finding("no_uncertainty", "warning", words))
-    drawn = motors is not None
     return Case(
         estimate.wheel,
         chosen,
         problem,
         required,
         ensemble,
-        drawn,
+        motors is not None,
         friction,
         driver,
         load,
