@@ -232,9 +232,7 @@ def _filter(problem: Problem, c: _Gains, margin: float, peak: float, hump: float
 
 def _solve_bandwidth(problem: Problem, wished: float, margin: float, peak: float) -> Feedback:
     nyquist = math.pi / problem.loop.sample_time
-    found = None
-    if wished < nyquist:
-        found = _search(problem, margin, peak, "load", bandwidth=wished)
+    found = _search(problem, margin, peak, "load", wished) if wished < nyquist else None
     if found is not None and loop_margins(problem.plant, found[0]).crossover < 1.05 * wished:
         return found[0]
     nearest = _search(problem, margin, peak, "tracking")

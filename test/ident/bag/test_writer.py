@@ -11,8 +11,8 @@ from recordings import TYPES, Sent, assert_read, motion, serialized, write_mcap,
 from rosbags.highlevel import AnyReader
 
 from smp_motor_ident.bag import BagWriter, read_records
-from smp_motor_ident.bag.replay import Replay, find_offered_qos
 from smp_motor_ident.errors import BagError
+from smp_motor_ident.nodes.play import Replay, find_offered_qos
 
 FLOAT = "std_msgs/msg/Float64"
 
