@@ -48,7 +48,7 @@ TESTS = {
     CONTROL + "wheel.loop": "control/test_wheel_loop.py control/test_wheel_limits.py",
     CONTROL + "wheel.acceptance": "control/test_acceptance.py",
     CONTROL + "body.odometry": "control/test_odometry.py",
-    CONTROL + "body.command": "control/test_diff_drive_conformance.py",
+    CONTROL + "body.command": "control/test_diff_drive_conformance.py control/test_skid_steer.py",
     BAG + "counter": "ident/bag/test_counter.py",
     BAG + "salvage": "ident/bag/test_salvage.py",
     BAG + "unpack": "ident/bag/test_unpack.py",

@@ -13,7 +13,7 @@ from backports import zstd
 from recordings import assert_read, motion, notes, write_mcap, write_metadata, write_sqlite
 
 from smp_motor_ident.bag import read_records
-from smp_motor_ident.bag.readers.sqlite import Row, salvage
+from smp_motor_ident.bag.salvage import Row, salvage
 from smp_motor_ident.errors import BagError
 
 # Every integer size of SQLite, with both signs: none (0 and 1), 1 to 4, 6 and 8 bytes.
