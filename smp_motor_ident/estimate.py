@@ -4,9 +4,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import AbstractContextManager, nullcontext
-from functools import cache
-from typing import Any
 
 import numpy as np
 
@@ -18,17 +15,17 @@ from smp_motor_ident.fit.descend import Fit, constrain, evaluate_on_rows, fit, r
 from smp_motor_ident.fit.search import prune, search
 from smp_motor_ident.infer.answer import state_quantities
 from smp_motor_ident.infer.findings import EstimateContext, collect_findings, refuse_unexplained
+from smp_motor_ident.infer.provenance import describe_provenance
 from smp_motor_ident.infer.residuals import check_residuals
 from smp_motor_ident.infer.uncertainty import collect_contributions, detect_levels
 from smp_motor_ident.infer.validation import compute_fit_percents
-from smp_motor_ident.quality.differenced import read_count_rounding
+from smp_motor_ident.one_thread import one_thread
 from smp_motor_ident.quality.excitation import find_excitation
 from smp_motor_ident.quality.repair import repair_records
-from smp_motor_ident.quality.resolution import speed_quantum
 from smp_motor_ident.quality.screen import screen_records
 from smp_motor_ident.record import Record
 from smp_motor_ident.request import LOSSES, Request, check_request
-from smp_motor_ident.result import Candidate, Estimate
+from smp_motor_ident.result import Estimate
 
 
 def estimate(
@@ -120,7 +117,6 @@ def _estimate_group(group: list[Record], request: Request, found: Sequence[Findi
         chain=best.chain.record,
         fit_percent=context.percent,
         residuals=context.tests,
-        candidates=describe_candidates(context),
         findings=(*found, *collect_findings(context)),
         **describe_provenance(context),
     )
@@ -144,72 +140,3 @@ def _report_left_out(refusal: SmpError) -> Finding:
         {},
         "record the armature's current with its sign, unfiltered",
     )
-
-
-def describe_provenance(context: EstimateContext) -> dict[str, Any]:
-    """Describe the records and the model of an `Estimate`, field by field."""
-    group, data = context.group, context.data
-    return {
-        "wheel": group[0].wheel,
-        "model": name_model(context),
-        "duration": float(sum(r.duration for r in group)),
-        "largest_voltage": max(float(np.abs(r.voltage).max()) for r in group),
-        "sources": tuple(dict.fromkeys(r.source for r in group if r.source)),
-        "hardware": group[0].hardware,
-        "samples": len(data),
-        "sample_time": data.rows.step,
-        "speed_noise": 0.0 if data.is_angle else float(context.found.noise[0].deviation[-1]),
-        "speed_step": _find_speed_step(context),
-        "angle_noise": _find_angle_noise(context),
-    }
-
-
-def name_model(context: EstimateContext) -> str:
-    """Return the structure of the motor that the data determine."""
-    if context.data.current is not None:
-        return "electromechanical"
-    if context.quantity("time_constant") is None:
-        return "static_gain"
-    return "first_order" if context.quantity("time_constant_product") is None else "second_order"
-
-
-def describe_candidates(context: EstimateContext) -> tuple[Candidate, ...]:
-    """Return the chosen chain."""
-    chosen = " + ".join(context.found.chain.codes)
-    return (Candidate(chosen, context.percent.estimation, context.found.deviance, True),)
-
-
-def _find_speed_step(context: EstimateContext) -> float:
-    """Return the largest step in which a recorded speed comes [rad/s]."""
-    if context.data.is_angle:
-        return 0.0
-    speeds = [r.velocity for r in context.group if r.velocity is not None]
-    return max(map(speed_quantum, speeds), default=0.0)
-
-
-def _find_angle_noise(context: EstimateContext) -> float:
-    """Return the noise of a recorded angle [rad], 0 where counts or a speed were recorded."""
-    group = context.group
-    counted = any(r.count is not None and r.hardware.counts_per_revolution for r in group)
-    if not context.data.is_angle or counted:
-        return 0.0
-    return max(map(read_count_rounding, group)) or float(context.found.noise[0].deviation[-1])
-
-
-def one_thread() -> AbstractContextManager[object]:
-    """Return a context in which the linear algebra library runs on one thread.
-
-    The tools set this before they import numpy; a program that imports numpy first needs this.
-    """
-    pools = _pools()
-    return nullcontext() if pools is None else pools.limit(limits=1)
-
-
-@cache
-def _pools() -> Any:
-    """Return the libraries' threads; None without threadpoolctl, which apt's numpy does without."""
-    try:
-        from threadpoolctl import ThreadpoolController
-    except ImportError:
-        return None
-    return ThreadpoolController()
