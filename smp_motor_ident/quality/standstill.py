@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Detect segments that begin at standstill.
 
-A motor without voltage that does not move for some rows is at rest.  A log that begins with its
-step does not show this: the motor was at rest without voltage before, and the time until it moves
-is a delay.  A motor that reverses is at rest only as long as its acceleration allows.
+A motor without voltage that does not move for some rows is at rest.  A log whose voltage rises from
+zero, or that begins with its step, shows this by the time until the motor moves, which is longer
+than its acceleration takes; a motor that reverses is at rest only as long as that.
 """
 
 from __future__ import annotations
@@ -36,9 +36,10 @@ def detect_rest_at_start(
             at_rest = output[a] if is_angle else 0.0
             out[g] = not (np.abs(output[begin] - at_rest) > least).any()
             continue
-        driven = b - a > 8 and on > 0 and bool((np.abs(voltage[a + 1 : a + 3]) > on).all())
+        # The voltage rises from zero, or the log begins with its step.
+        begins = np.abs(voltage[a]) < on or bool((np.abs(voltage[a + 1 : a + 3]) > on).all())
         known = np.flatnonzero(np.isfinite(output[a:b])) + a
-        if driven and known.size > 8:
+        if begins and on > 0 and known.size > 8:
             out[g] = _begins_at_rest(time[known], output[known], is_angle, quantum)
     return out
 
