@@ -63,7 +63,7 @@ def test_functions_are_drawn_in_the_order_in_which_they_are_called():
         "check_request", "repair_records", "screen_records", "find_excitation", "prepare",
         "_fit_best_chain",
         "detect_levels", "collect_contributions", "state_quantities", "compute_fit_percents",
-        "check_residuals", "refuse_unexplained", "describe_candidates", "collect_findings",
+        "check_residuals", "refuse_unexplained", "collect_findings",
         "describe_provenance",
     ]  # fmt: skip
     called = [body.index(f"{name}(") for name in order]
