@@ -25,7 +25,7 @@ from smp_motor_ident.report.drawing import Chart, Curve, document
 from smp_motor_ident.result import Estimate, Quantity
 from smp_motor_ident.tune.verification import Change, smooth_speed
 
-EXCITATION = ("--amplitude", "10", "--duration", "8")
+EXCITATION = ("--amplitude", "11", "--duration", "10")
 """Largest voltage [V] and length of a signal [s]."""
 
 ACCEPTED = (
