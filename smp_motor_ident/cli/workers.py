@@ -2,6 +2,7 @@
 """Run independent jobs in parallel, in as many processes as there are cores."""
 
 import ctypes
+import gc
 import multiprocessing
 import os
 import signal
@@ -28,6 +29,7 @@ def in_parallel(
         return {n: job(lambda text, n=n: say(f"{n}: {text}")) for n, job in jobs.items()}
     say(f"{doing} {', '.join(jobs)}")
     _JOBS.update(jobs)
+    gc.freeze()  # what is loaded stays shared: a collection in a child would copy its pages
     fork = multiprocessing.get_context("fork")
     pool = ProcessPoolExecutor(cores, mp_context=fork, initializer=end_with_parent)
     try:
