@@ -25,8 +25,7 @@ from smp_motor_ident.record import Record
 from smp_motor_ident.simulate.rows import Rows
 
 MIN_SEARCH_ROWS = 4000  # of the search; the chain is then fitted to all rows
-MAX_MERGED_COMMAND_DIFFERENCE = 0.01
-"""Difference of commands, over the largest, up to which thinning merges them."""
+MAX_MERGED_COMMAND_DIFFERENCE = 0.01  # over the largest, up to which thinning merges commands
 
 
 @dataclass(frozen=True, eq=False)

@@ -40,13 +40,11 @@ UNREPORTED_COMPONENTS = (
 )
 """Components without a finding."""
 MIN_REST_NOISE_SHARE = 0.9  # of white noise in the motion of a motor at rest
-MIN_SIGNIFICANT_SIZE = 3.0
-"""Size over its standard deviation from which an effect is a warning."""
+MIN_SIGNIFICANT_SIZE = 3.0  # standard deviations from which an effect is a warning
 UNREPORTED_PARAMETERS = ("current_offset", "vc", "eccentric_phase")
 """Parameters omitted from messages about their component."""
 MIN_REPORTED_SCATTER = 2.5  # between parts of a record, over chance
-MAX_NOTE_STD = 0.02
-"""Relative standard deviation of a quantity up to which such a scatter is a note."""
+MAX_NOTE_STD = 0.02  # relative, of a quantity up to which such a scatter is a note
 MAX_WARNING_STD = 0.2  # the same for a warning; above it a quantity is unreliable
 
 
