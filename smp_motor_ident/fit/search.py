@@ -96,7 +96,7 @@ def search(data: Data, policy: SelectionPolicy | None = None, say: Say = lambda 
 def measure_inadequacy(data: Data, found: Fit) -> float:
     """Return the disagreement between parts of the record relative to chance: 1 if adequate.
 
-    An angle that is explained to the resolution of its encoder asks for nothing more.
+    A motion that is explained to the rounding of its counts asks for nothing more.
     """
     if leaves_only_rounding(data, found.motion):
         return 1.0
