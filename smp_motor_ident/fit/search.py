@@ -41,6 +41,7 @@ MAX_ADEQUATE_SCATTER = 2.0  # between parts of a record that a chain explains
 MIN_DEVIANCE_DIFFERENCE = 1.0  # between fits at different minima
 MIN_CORRELATION_SIGMAS = 4.0  # at which an autocorrelation differs from zero
 MAX_MEMORY_ROWS = 40  # of a residual, unless it repeats itself as a periodic command does
+MAX_ALTERNATIVE_COST_RATIO = 1.5  # of a chain without second lag of the motor to one with it
 MIN_CERTAIN_SIZE = 20.0  # standard deviations of a component that is kept without a test
 REQUIRED_COMPONENTS = ("friction", "asymmetric_friction")  # components that every motor has
 
@@ -261,13 +262,22 @@ def _fit_starts(data: Data, chains: Sequence[Chain], policy: SelectionPolicy) ->
         chain = chain.with_values({"vc": max(chain.values["vc"], 0.01 * scales.volts)})
         chain = chain.with_component(*choose_plain_sensor(data))
         chain = add_fixed_effects(chain, data, policy.given)
-        begun = approach(data, chain, scales, data.initial, SEARCH_ORDER)
-        if all(abs(begun.deviance - other.deviance) > MIN_DEVIANCE_DIFFERENCE for other in firsts):
-            firsts.append(begun)
+        firsts.append(approach(data, chain, scales, data.initial, SEARCH_ORDER))
+    firsts = _drop_equal_fits(firsts)
     fits = [fit(data, first, 2, SEARCH_ORDER, SEARCH_TOLERANCE) for first in firsts]
+    fits = _drop_equal_fits(fits)
     if not policy.first_order:
         fits = [_fit_second_order(data, first) for first in fits]
     return sorted(fits, key=lambda f: f.deviance)
+
+
+def _drop_equal_fits(fits: Sequence[Fit]) -> list[Fit]:
+    """Return one fit of every minimum."""
+    kept: list[Fit] = []
+    for one in fits:
+        if all(abs(one.deviance - other.deviance) > MIN_DEVIANCE_DIFFERENCE for other in kept):
+            kept.append(one)
+    return kept
 
 
 def choose_plain_sensor(data: Data) -> tuple[Component, Mapping[str, float]]:
@@ -339,6 +349,19 @@ def fit_roughly(data: Data, chain: Chain, like: Fit) -> Fit:
     return descend(data, chain, like.scales, like.initial, like.noise, 10, SEARCH_TOLERANCE)
 
 
+def fit_alternative(data: Data, chain: Chain, like: Fit) -> Fit | None:
+    """Fit a chain of `replace_second_lag`; return None where it explains much less than another.
+
+    A second lag of the motor is added last: with it a distant fit would end at the other.
+    """
+    held = replace(chain, fixed=chain.fixed | {"ln_a2"})
+    begun = descend(data, held, like.scales, like.initial, like.noise, 4, 10 * SEARCH_TOLERANCE)
+    if begun.linear.cost > MAX_ALTERNATIVE_COST_RATIO * like.linear.cost:
+        return None
+    chain = replace(begun.chain, fixed=chain.fixed)
+    return descend(data, chain, like.scales, begun.initial, like.noise, 10, SEARCH_TOLERANCE)
+
+
 def _refit_noise(data: Data, found: Fit) -> Fit:
     """Return the fit under the noise of its own residual."""
     noise = fit_noises(data, found.linear, SEARCH_ORDER)
@@ -365,7 +388,10 @@ def _fit_best_candidate(
         if best is not None and candidate.gain < MIN_GAIN_RATIO * best[0]:
             continue  # the next round screens it again
         say(f"fitting {candidate.component.title}")
-        one = fit_roughly(data, candidate.chain, found)
+        fits = fit_roughly if candidate in promising else fit_alternative
+        one = fits(data, candidate.chain, found)
+        if one is None:
+            continue
         net = compute_gain(data, found.linear, one.linear.residual) - candidate.price
         if best is None or net > best[0]:
             best = net, one

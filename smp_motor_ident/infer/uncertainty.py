@@ -28,7 +28,7 @@ from smp_motor_ident.fit.descend import Fit, evaluate_on_rows
 from smp_motor_ident.fit.search import (
     SelectionPolicy,
     compute_relative_prior_std,
-    fit_roughly,
+    fit_alternative,
     list_candidates,
     replace_second_lag,
 )
@@ -215,24 +215,31 @@ def assess_second_lag_alternatives(data: Data, found: Fit) -> Iterator[Contribut
     """Yield the change of the parameters if another component replaces the second lag.
 
     Both fit nearly alike with distant parameters, so derivatives do not show it.  The other is
-    weighted by its prior and by the ratio of the likelihoods.
+    weighted by its prior and by the ratio of the likelihoods.  Where the chain has the component
+    already, the deviance between both replaces that of the quadratic approximation.
     """
     for one, chain in replace_second_lag(found, data):
-        other = fit_roughly(data, chain, found)
-        odds = one.prior / (1 - one.prior)
-        odds *= math.exp(min(0.5 * (found.linear.cost - other.linear.cost), 50.0))
-        weight = math.sqrt(odds / (1 + odds))
-        changes = []
-        for p in found.chain.free:
-            change = other.chain.values.get(p.name, 0.0) - found.chain.values[p.name]
-            changes.append(math.expm1(change) if p.unit == "ln" else change)
+        other = fit_alternative(data, chain, found)
+        if other is None:
+            continue
+        difference = other.linear.cost - found.linear.cost
+        values = found.chain.values
+        change = np.array([other.chain.values.get(n, 0.0) - values[n] for n in found.names])
+        if found.chain.has(one.code):
+            quadratic = float(change @ found.linear.normal @ change)
+            weight = math.sqrt(max(1 / max(difference, 1.0) - 1 / max(quadratic, 1.0), 0.0))
+        else:
+            odds = one.prior / (1 - one.prior) * math.exp(min(-0.5 * difference, 50.0))
+            weight = math.sqrt(odds / (1 + odds))
+        units = np.array([p.unit for p in found.chain.free])
+        change = np.where(units == "ln", np.expm1(change), change)
         adds = {
             REPORTED[p.name]: weight * other.chain.values[p.name]
             for p in one.parameters
             if p.name in REPORTED and p.name not in found.names
         }
         nothing = np.zeros_like(found.covariance)
-        yield Contribution(one.code, nothing, weight * np.array(changes), adds)
+        yield Contribution(one.code, nothing, weight * change, adds)
 
 
 def assess_absent_components(
