@@ -122,7 +122,7 @@ class Component:
         ln_a1 = values["ln_a0"] + math.log(rest)
         return {
             self.lag: values.get(self.lag, 0.0) + second / self.lateness, "ln_a1": ln_a1,
-            "ln_a2": ln_a1 + math.log(min(0.01 * rest, 0.1 * second)),
+            "ln_a2": ln_a1 + math.log(0.01 * rest),
         }  # fmt: skip
 
 

@@ -106,6 +106,7 @@ def _find_only_step(command: Array) -> float:
 
 
 MIN_SUPPORTED_PROBABILITY = 0.1  # of a component in the random uncertainty
+MAX_LEFT_SECOND_LAG = 0.1  # of the motor's second lag, where another component replaces it
 MIN_SHOWN_VARIANCE_RATIO = 100.0  # prior over posterior variance of a size that the data show
 
 DRIVER_SLOTS = (
@@ -219,11 +220,12 @@ def assess_second_lag_alternatives(data: Data, found: Fit) -> Iterator[Contribut
     already, the deviance between both replaces that of the quadratic approximation.
     """
     for one, chain in replace_second_lag(found, data):
-        other = fit_alternative(data, chain, found)
+        values = found.chain.values
+        least = min(chain.values["ln_a2"], values["ln_a2"] + math.log(MAX_LEFT_SECOND_LAG))
+        other = fit_alternative(data, chain.with_values({"ln_a2": least}), found)
         if other is None:
             continue
         difference = other.linear.cost - found.linear.cost
-        values = found.chain.values
         change = np.array([other.chain.values.get(n, 0.0) - values[n] for n in found.names])
         if found.chain.has(one.code):
             quadratic = float(change @ found.linear.normal @ change)
