@@ -354,7 +354,7 @@ def zeros(n: int, file: h5py.File, every: int = 1) -> None:
 def cells(folder: Path) -> None:
     """Write a structure whose two fields are the same structure, and so on."""
     value: Any = np.arange(3.0)
-    for _ in range(15):
+    for _ in range(share(2**15).bit_length() - 1):
         value = {"a": value, "b": value}
     scipy.io.savemat(folder / "a.mat", {"t": value}, do_compression=True)
 

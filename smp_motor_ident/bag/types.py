@@ -77,7 +77,7 @@ class Types:
     def __init__(self, files: Iterable[str | os.PathLike[str]] = ()) -> None:
         self._given: dict[str, Fields] = {}
         self._seen: set[str] = set()
-        self._left = 6 * MAX_DEFINITION_SIZE
+        self._left = 3 * MAX_DEFINITION_SIZE
         for given in files:
             path = Path(given)
             inside = path.rglob("*.msg") if path.is_dir() else [path]
@@ -125,7 +125,7 @@ class Types:
         self._left -= 0 if text in self._seen else len(text)
         self._seen.add(text)
         if self._left < 0:
-            raise BagError(f"definitions have more than {6 * MAX_DEFINITION_SIZE:.0f} characters")
+            raise BagError(f"definitions have more than {3 * MAX_DEFINITION_SIZE:.0f} characters")
 
     def _find_by_last_name(self, name: str) -> dict[str, Fields]:
         """Return a definition by the type's last name where the user's folder says no package."""
