@@ -76,9 +76,9 @@ def partition_rows(data: Data, found: Fit) -> Iterator[tuple[str, Integers]]:
 def compute_scatter(found: Fit, name: str, label: Integers) -> Scatter | None:
     """Return the scatter between labelled parts."""
     linear = found.linear
-    m, p = linear.row.size, linear.columns.shape[1]
+    m, p = linear.data.row.size, linear.columns.shape[1]
     count = int(label.max()) + 1
-    which = label[linear.row]
+    which = label[linear.data.row]
     scores = linear.columns[:m] * linear.residual[:m, None]
     sums = np.stack([np.bincount(which, s, count) for s in scores.T], axis=1)
     expected = np.zeros((count, p, p))

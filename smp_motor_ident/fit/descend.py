@@ -123,7 +123,7 @@ def descend(
         near = 0 <= expected < MAX_REUSE_COST_SHARE * linear.cost and fold < MAX_REUSE_LOG_STEP
         following = _simulate_step(place, linear, near)
         gained = linear.cost - following.cost
-        least = tolerance * min(linear.cost / linear.row.size, 1.0)
+        least = tolerance * min(linear.cost / linear.data.row.size, 1.0)
         if _is_lower(following, linear):
             at, start, linear = trial, place[3], following
             moved = 0.0 if linear.exact else moved + fold

@@ -27,32 +27,82 @@ INITIAL_STATE_PRIOR_STD = 2.0  # of q and speed, relative to the largest of the 
 class Linear:
     """Residuals and derivatives of a chain at its values, whitened; segments' states eliminated.
 
-    The last ``priors`` rows are of the motor's prior.
+    The last rows of ``residual`` and ``columns`` are of the motor's prior.
     """
 
-    residual: Array  # shape (m + priors,)
-    columns: Array  # shape (m + priors, p)
-    row: Integers  # shape (m,): row of the record
-    output: Integers  # shape (m,): place of the output
-    priors: int
-    local_step: Array  # shape (segments, 3): of the initial states at a step of zero
-    local_gain: Array  # shape (segments, 3, p): its decrease per parameter step
-    local: Array  # shape (3, m): derivatives by the initial states
-    inverse: Array  # shape (segments, 3, 3): of their normal matrix, with their prior
+    data: Data
+    slopes: Array  # shape (p + 3, m): derivatives by parameters and states of segments
+    gram: Array  # shape (segments, p + 3, p + 3): inner products of ``slopes``
+    inverse: Array  # shape (segments, 3, 3): of the states' normal matrix, with their prior
+    local_gain: Array  # shape (segments, 3, p): decrease of the states per parameter step
     normal: Array  # shape (p, p): normal matrix of the parameters
-    simulated: tuple[Array, ...]  # every output, shape (n,)
+    prior_columns: Array  # shape (priors, p)
     derivatives: tuple[Array, ...]  # of every output before whitening, shape (p + 3, known rows)
-    exact: bool  # whether they are of these values, not of values nearby
+    misfit: Array  # shape (m,): residuals at the initial states of the simulation
+    prior_residual: Array  # shape (priors,)
+    local_step: Array  # shape (segments, 3): of the initial states at a step of zero
+    cost: float  # sum of squares
+    gradient: Array  # shape (p,): half its decrease per parameter step
+    simulated: tuple[Array, ...]  # every output, shape (n,)
+    exact: bool  # whether derivatives are of these values, not of values nearby
 
     @cached_property
-    def cost(self) -> float:
-        """Sum of squares."""
-        return float(self.residual @ self.residual)
+    def residual(self) -> Array:
+        """Residuals at the best initial states, shape (m + priors,)."""
+        rest = self.misfit[None].copy()
+        self._eliminate_states(rest, self.local_step[:, :, None])
+        return np.concatenate([rest[0], self.prior_residual])
 
     @cached_property
-    def gradient(self) -> Array:
-        """Half the decrease of the sum of squares per parameter step, shape (p,)."""
-        return np.asarray(self.columns.T @ self.residual)
+    def columns(self) -> Array:
+        """Derivatives at the best initial states, shape (m + priors, p)."""
+        p = self.normal.shape[0]
+        whole = np.empty((p, self.misfit.size + self.prior_residual.size))
+        whole[:, self.misfit.size :] = self.prior_columns.T
+        rest = whole[:, : self.misfit.size]
+        rest[:] = self.slopes[:p]
+        self._eliminate_states(rest, self.local_gain)
+        return whole.T
+
+    def fit_states(self, misfit: Array, pull: Array) -> Array:
+        """Return the residuals at the best initial states of another misfit, shape (m,)."""
+        p, rest = self.normal.shape[0], misfit[None].copy()
+        inner = self._project(misfit)[:, p:] - pull
+        self._eliminate_states(rest, self.inverse @ inner[:, :, None])
+        return np.asarray(rest[0])
+
+    def with_misfit(
+        self, misfit: Array, pull: Array, prior: Array, simulated: tuple[Array, ...], exact: bool
+    ) -> Linear:
+        """Return the residuals of another simulation with these derivatives.
+
+        ``pull``, shape (segments, 3): gradient of the priors of the initial states.
+        """
+        p, inner = self.normal.shape[0], self._project(misfit)
+        step = (self.inverse @ (inner[:, p:] - pull)[:, :, None])[:, :, 0]
+        left = inner - (self.gram[:, :, p:] @ step[:, :, None])[:, :, 0]
+        cost = misfit @ misfit - (step * (inner + left)[:, p:]).sum() + prior @ prior
+        gradient = left[:, :p].sum(axis=0) - np.einsum("gsp,gs->p", self.local_gain, left[:, p:])
+        return replace(
+            self, misfit=misfit, prior_residual=prior, local_step=step, cost=float(cost),
+            gradient=gradient + self.prior_columns.T @ prior, simulated=simulated, exact=exact,
+        )  # fmt: skip
+
+    def _project(self, misfit: Array) -> Array:
+        """Return the inner products of slopes and misfit, shape (segments, p + 3)."""
+        return np.array(
+            [
+                sum(self.slopes[:, first:last] @ misfit[first:last] for first, last in ends)
+                for ends in self.data.bounds
+            ]
+        )
+
+    def _eliminate_states(self, lines: Array, steps: Array) -> None:
+        """Subtract the change by steps of the initial states, shape (segments, 3, lines)."""
+        local = self.slopes[-3:]
+        for step, ends in zip(steps, self.data.bounds, strict=True):
+            for first, last in ends:
+                lines[:, first:last] -= step.T @ local[:, first:last]
 
 
 def invert(normal: Array) -> Array:
@@ -104,42 +154,41 @@ def whiten(
     simulated: tuple[Array, ...], derivatives: tuple[Array, ...], exact: bool,
 ) -> Linear:  # fmt: skip
     """Return the residuals and derivatives of a simulation under a noise model."""
-    residuals, rows, _ = build_prior_rows(chain, scales)
-    m, p = data.row.size, len(chain.free)
-    whole = np.zeros((p + 4, m + residuals.size))
-    whole[0, m:], whole[1 : p + 1, m:] = residuals, rows.T
-    first = 0
+    prior, rows, _ = build_prior_rows(chain, scales)
+    p, first = len(chain.free), 0
+    slopes = np.empty((p + 3, data.row.size))
     for k, lines in enumerate(derivatives):
-        part = whole[:, first : first + data.known[k].size]
-        part[:1] = _whiten_residual(data, k, noise[k], simulated[k])
-        part[1:] = noise[k].whiten(lines, _select_runs(data, k, noise[k]))
-        first += data.known[k].size
+        last = first + data.known[k].size
+        slopes[:, first:last] = noise[k].whiten(lines, _select_runs(data, k, noise[k]))
+        first = last
+    misfit = _whiten_misfit(data, noise, simulated)
     if np.isfinite(data.huber):
-        whole[:, :m] *= _compute_huber_weights(whole[0, :m], data.huber)
-    g = data.rows.segment.size - 1
-    solved, inverse = np.zeros((g, 3, p + 1)), np.zeros((g, 3, 3))
-    pull = _compute_state_prior_gradient(scales, initial)
-    prior = np.diag(_compute_state_prior_weights(scales))
-    for k, ends in enumerate(data.bounds):
-        inner = np.zeros((3, p + 4))
-        for first, last in ends:
-            inner += whole[p + 1 :, first:last] @ whole[:, first:last].T
-        inner[:, 0] -= pull[k]
+        slopes *= _compute_huber_weights(misfit, data.huber)
+        misfit *= _compute_huber_weights(misfit, data.huber)
+    gram = np.array(
+        [
+            sum(slopes[:, first:last] @ slopes[:, first:last].T for first, last in ends)
+            for ends in data.bounds
+        ]
+    )
+    inverse = np.zeros((len(gram), 3, 3))
+    weights = np.diag(_compute_state_prior_weights(scales))
+    for k, inner in enumerate(gram):
         free = slice(2, 3) if data.starts_at_rest[k] else slice(0, 3)
-        small = (inner[:, p + 1 :] + prior)[free, free]
+        small = (inner[p:, p:] + weights)[free, free]
         size = np.diag(small)
         scale = np.sqrt(np.where(size > 0, size, 1.0))
         small = small / np.outer(scale, scale) + 1e-12 * np.eye(scale.size)
         inverse[k, free, free] = np.linalg.inv(small) / np.outer(scale, scale)
-        solved[k] = inverse[k] @ inner[:, : p + 1]
-        for first, last in ends:
-            whole[: p + 1, first:last] -= solved[k].T @ whole[p + 1 :, first:last]
-    columns = whole[1 : p + 1]
-    return Linear(
-        whole[0], columns.T, data.row, data.output, residuals.size, solved[:, :, 0],
-        solved[:, :, 1:], whole[p + 1 :, :m], inverse, columns @ columns.T, simulated, derivatives,
-        exact,
+    gain = inverse @ gram[:, p:, :p]
+    rest = np.concatenate([np.tile(np.eye(p), (len(gram), 1, 1)), -gain.swapaxes(1, 2)], axis=2)
+    normal = (rest @ gram @ rest.swapaxes(1, 2)).sum(axis=0) + rows.T @ rows
+    begun = Linear(
+        data, slopes, gram, inverse, gain, normal, rows, derivatives, misfit, prior,
+        np.zeros((len(gram), 3)), 0.0, np.zeros(p), simulated, exact,
     )  # fmt: skip
+    pull = _compute_state_prior_gradient(scales, initial)
+    return begun.with_misfit(misfit, pull, prior, simulated, exact)
 
 
 def reuse_derivatives(
@@ -147,12 +196,9 @@ def reuse_derivatives(
 ) -> Linear:
     """Return the residuals of a chain with the derivatives of another near it."""
     simulated = _simulate(data, chain, scales, initial)
-    residual, solved = _eliminate_states(data, scales, initial, noise, simulated, like)
+    pull = _compute_state_prior_gradient(scales, initial)
     prior = build_prior_rows(chain, scales)[0]
-    return replace(
-        like, residual=np.concatenate([residual, prior]), local_step=solved, simulated=simulated,
-        exact=False,
-    )  # fmt: skip
+    return like.with_misfit(_whiten_misfit(data, noise, simulated), pull, prior, simulated, False)
 
 
 def compute_residual(
@@ -162,8 +208,10 @@ def compute_residual(
 
     Initial states are fitted by the derivatives of another.
     """
-    simulated = _simulate(data, chain, scales, initial)
-    found, _ = _eliminate_states(data, scales, initial, noise, simulated, like)
+    misfit = _whiten_misfit(data, noise, _simulate(data, chain, scales, initial))
+    if np.isfinite(data.huber):
+        misfit *= _compute_huber_weights(misfit, data.huber)
+    found = like.fit_states(misfit, _compute_state_prior_gradient(scales, initial))
     return found if np.isfinite(found).all() else None
 
 
@@ -231,37 +279,19 @@ def _simulate(data: Data, chain: Chain, scales: Scales, initial: Array) -> tuple
     )
 
 
-def _whiten_residual(data: Data, k: int, noise: Noise, simulated: Array) -> Array:
-    """Return the whitened residual of an output, shape (1, known rows)."""
-    rest = _select_measured(data, k, (data.outputs[k] - simulated)[None])
-    return noise.whiten(rest, _select_runs(data, k, noise))
+def _whiten_misfit(data: Data, noise: Sequence[Noise], simulated: tuple[Array, ...]) -> Array:
+    """Return the whitened residual of every measured value, shape (m,)."""
+    parts = []
+    for k, its in enumerate(noise):
+        rest = _select_measured(data, k, (data.outputs[k] - simulated[k])[None])
+        parts.append(its.whiten(rest, _select_runs(data, k, its))[0])
+    return parts[0] if len(parts) == 1 else np.concatenate(parts)
 
 
 def _select_measured(data: Data, k: int, lines: Array) -> Array:
     """Return the measured rows of lines of an output, shape (c, n)."""
     known = data.known[k]
     return lines if known.size == lines.shape[1] else lines[:, known]
-
-
-def _eliminate_states(
-    data: Data, scales: Scales, initial: Array, noise: Sequence[Noise],
-    simulated: tuple[Array, ...], like: Linear,
-) -> tuple[Array, Array]:  # fmt: skip
-    """Eliminate the initial states from a residual, shape (m,); return it and their step."""
-    every = zip(noise, simulated, strict=True)
-    r = np.concatenate([_whiten_residual(data, k, *one)[0] for k, one in enumerate(every)])
-    if np.isfinite(data.huber):
-        r *= _compute_huber_weights(r, data.huber)
-    pull = _compute_state_prior_gradient(scales, initial)
-    solved = np.zeros((len(pull), 3))
-    for k, ends in enumerate(data.bounds):
-        right = -pull[k]
-        for first, last in ends:
-            right = right + like.local[:, first:last] @ r[first:last]
-        solved[k] = like.inverse[k] @ right
-        for first, last in ends:
-            r[first:last] -= solved[k] @ like.local[:, first:last]
-    return r, solved
 
 
 def _select_runs(data: Data, k: int, noise: Noise) -> Integers:

@@ -158,7 +158,7 @@ def _is_fixed(one: Component, chain: Chain) -> bool:
 
 def screen_candidates(found: Fit, data: Data, policy: SelectionPolicy) -> list[Candidate]:
     """Return all candidates with their expected gains, the best first."""
-    m = found.linear.row.size
+    m = found.linear.data.row.size
     columns = found.linear.columns[:m]
     base = found.linear.residual[:m]
     best: dict[str, Candidate] = {}
@@ -218,7 +218,7 @@ def compute_gain(data: Data, before: Linear, after: Array) -> float:
     """
     total = 0.0
     for k in range(len(data.outputs)):
-        part = before.output == k
+        part = before.data.output == k
         old, new = before.residual[: part.size][part], after[: part.size][part]
         energy = float(new @ new)
         if energy <= 0 or not np.isfinite(energy):

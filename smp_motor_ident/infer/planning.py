@@ -134,7 +134,7 @@ def _predict_relative_std(
     )
     scales = data.scales(estimate.value("time_constant"))
     linear = linearise(data, chain, scales, np.zeros((1, 4)), noise)
-    columns = linear.columns[: linear.row.size]
+    columns = linear.columns[: linear.data.row.size]
     values, rows = jacobian(chain)
     spread = np.diag(rows @ invert(columns.T @ columns) @ rows.T)
     std = dict(zip(values, np.sqrt(np.maximum(spread, 0.0)), strict=True))

@@ -87,8 +87,8 @@ def check_residuals(data: Data, found: Fit) -> ResidualTests:
 def _place_whitened_residual(data: Data, found: Fit) -> Array:
     """Return the whitened residual of the motion, NaN where nothing was measured."""
     out = np.full(len(data), np.nan)
-    part = found.linear.output == 0
-    rows = found.linear.row[part]
+    part = found.linear.data.output == 0
+    rows = found.linear.data.row[part]
     measured = np.isfinite(data.motion[rows])
     out[rows[measured]] = found.linear.residual[: part.size][part][measured]
     return out

@@ -140,7 +140,7 @@ def collect_contributions(
             parts.append(Contribution(one.name, one.excess))
     some = data.thin(MIN_SEARCH_ROWS)
     seen = found if some is data else evaluate_on_rows(some, found)
-    share = seen.linear.row.size / found.linear.row.size
+    share = seen.linear.data.row.size / found.linear.data.row.size
     parts += assess_absent_components(some, seen, bool(levels.one_size), 1 / share)
     parts += assess_second_lag_alternatives(some, seen)
     seconds = TIMING_ACCURACY * data.sample if timing is None else timing
@@ -150,7 +150,7 @@ def collect_contributions(
 
 def assess_noise(found: Fit) -> list[Contribution]:
     """Return the covariance between repeated recordings."""
-    m = found.linear.row.size
+    m = found.linear.data.row.size
     columns = found.linear.columns[:m]
     half = found.covariance @ columns.T
     return [Contribution("noise", half @ half.T)]
@@ -161,7 +161,7 @@ def assess_priors(found: Fit) -> list[Contribution]:
 
     Together with the noise of the data it is the whole covariance of the fit.
     """
-    m = found.linear.row.size
+    m = found.linear.data.row.size
     nothing = np.zeros_like(found.covariance)
     shifts = found.linear.columns[m:] @ found.covariance
     thresholds = [p.name for p in found.chain.free if p.threshold]
@@ -206,7 +206,7 @@ def assess_timing(data: Data, found: Fit, seconds: float) -> list[Contribution]:
     r = found.residual(data, found.chain.with_component(Delay(), {"delay": late}))
     if r is None:
         return []
-    m = found.linear.row.size
+    m = found.linear.data.row.size
     signature = r - found.linear.residual[:m]
     shift = found.covariance @ (found.linear.columns[:m].T @ signature)
     return [Contribution("timing", np.zeros_like(found.covariance), -shift * seconds / late)]
@@ -279,7 +279,7 @@ def _assess_absent_component(
     r = found.residual(data, chain)
     if r is None:
         return None
-    base, m = found.linear.residual, found.linear.row.size
+    base, m = found.linear.residual, found.linear.data.row.size
     signature = np.concatenate([r - base[:m], np.zeros(base.size - m)])
     columns = found.linear.columns
     shift = found.covariance @ (columns.T @ signature)  # of the parameters, for this size
