@@ -22,9 +22,11 @@ from smp_motor_ident.fit.linear import (
     Linear,
     build_prior_rows,
     compute_residual,
+    differentiate,
     invert,
     linearise,
     reuse_derivatives,
+    simulate_outputs,
     update_initial_states,
     whiten,
 )
@@ -33,6 +35,7 @@ from smp_motor_ident.fit.noise import MAX_ORDER, Noise, fit_noise
 MAX_LOG_STEP = 1.5  # of a logarithm
 MAX_STEPS = 30
 DEVIANCE_TOLERANCE = 1e-2  # a tenth of a standard deviation
+NEGLIGIBLE_GAIN = 0.1  # predicted gain over the tolerance, below which a step is not taken
 MAX_DAMPING = 100.0
 MAX_REUSE_COST_SHARE = 0.03  # predicted gain over cost up to which derivatives are reused
 MAX_REUSE_LOG_STEP = 0.2  # step of a logarithm up to which they are
@@ -118,12 +121,14 @@ def descend(
         trial = at.with_values(_apply_step(at, scales, step))
         taken = np.array([trial.values[p.name] - at.values[p.name] for p in at.free])
         expected = float(taken @ (2 * linear.gradient - linear.normal @ taken))
+        least = tolerance * min(linear.cost / linear.data.row.size, 1.0)
+        if 0 <= expected < NEGLIGIBLE_GAIN * least:
+            break
         fold = _find_longest_log_step(at, taken)
         place = data, trial, scales, update_initial_states(start, linear, taken), noise
         near = 0 <= expected < MAX_REUSE_COST_SHARE * linear.cost and fold < MAX_REUSE_LOG_STEP
         following = _simulate_step(place, linear, near)
         gained = linear.cost - following.cost
-        least = tolerance * min(linear.cost / linear.data.row.size, 1.0)
         if _is_lower(following, linear):
             at, start, linear = trial, place[3], following
             moved = 0.0 if linear.exact else moved + fold
@@ -222,7 +227,7 @@ def approach(
     if data.is_angle:
         noise[0] = Noise.integrated(float(np.nanstd(data.speed)) * data.rows.step or 1.0)
     found = descend(data, chain, scales, initial, noise, max_steps=20, tolerance=1.0)
-    return found.with_noise(data, fit_noises(data, found.linear, max_order))
+    return found.with_noise(data, fit_noises(data, found.linear.simulated, max_order))
 
 
 def fit(
@@ -236,7 +241,9 @@ def fit(
     found = begun.descend(data, 1.0, 8)
     least = max(10 * tolerance, 1.0)
     for _ in range(rounds):
-        noise = fit_noises(data, found.linear, max_order)
+        noise = fit_noises(data, found.linear.simulated, max_order)
+        if _compute_noise_gain(data, found, noise) < least:
+            return found.descend(data, tolerance)
         other = found.with_noise(data, noise).descend(data, tolerance)
         gained = _compute_bic(data, found) - _compute_bic(data, other)
         if gained > 0:
@@ -255,13 +262,25 @@ def refine(data: Data, found: Fit) -> Fit:
         return found
     white = (Noise.white(float(np.nanstd(data.motion - found.motion))), *found.noise[1:])
     begun = found.with_noise(data, white).descend(data)
-    other = fit(data, begun.with_noise(data, fit_noises(data, begun.linear)))
+    other = fit(data, begun.with_noise(data, fit_noises(data, begun.linear.simulated)))
     return min(found, other, key=lambda f: _compute_bic(data, f))
 
 
 def _compute_bic(data: Data, found: Fit) -> float:
     counts = zip(found.noise, data.known, strict=True)
     return found.deviance + sum(n.order * math.log(max(k.size, 2)) for n, k in counts)
+
+
+def _compute_noise_gain(data: Data, found: Fit, noise: Sequence[Noise]) -> float:
+    """Return how much another noise lowers the criterion at the same values."""
+    gain = 0.0
+    for k, known in enumerate(data.known):
+        rest = (data.outputs[k] - found.linear.simulated[k])[known]
+        for sign, its in ((1, found.noise[k]), (-1, noise[k])):
+            gain += sign * (
+                its.deviance(rest, data.runs[k]) + its.order * math.log(max(known.size, 2))
+            )
+    return gain
 
 
 def constrain(data: Data, found: Fit, constraints: Sequence[Constraint]) -> Fit:
@@ -280,17 +299,26 @@ def evaluate_on_rows(data: Data, found: Fit) -> Fit:
     """Evaluate a fit on other rows of its recording, at the same values."""
     chain, scales = found.chain, found.scales
     white = tuple(Noise.white(float(np.nanstd(y)) or 1.0) for y in data.outputs)
-    linear = linearise(data, chain, scales, data.initial, white)
-    initial = update_initial_states(data.initial, linear, np.zeros(len(chain.free)))
-    linear = reuse_derivatives(data, chain, scales, initial, white, linear)
-    begun = replace(found, initial=initial, noise=white, linear=linear)
-    return begun.with_noise(data, fit_noises(data, linear))
+    simulated, derivatives = differentiate(data, chain, scales, data.initial)
+    states = tuple(slopes[-3:] for slopes in derivatives)
+    begun = whiten(data, _fix_all(chain), scales, data.initial, white, simulated, states, True)
+    initial = update_initial_states(data.initial, begun, np.zeros(0))
+    simulated = simulate_outputs(data, chain, scales, initial)
+    noise = tuple(fit_noises(data, simulated))
+    linear = whiten(data, chain, scales, initial, noise, simulated, derivatives, False)
+    deviance = _compute_deviance(data, linear, noise)
+    return replace(found, initial=initial, noise=noise, linear=linear, deviance=deviance)
+
+
+def _fix_all(chain: Chain) -> Chain:
+    """Return a chain without free parameters."""
+    return replace(chain, fixed=frozenset(p.name for p in chain.parameters), constraints=())
 
 
 def simulate_freely(data: Data, chain: Chain, scales: Scales) -> Array:
     """Simulate the motion freely from fitted initial states."""
     chain = chain.without_slot("current sensor")
-    fixed = replace(chain, fixed=frozenset(p.name for p in chain.parameters), constraints=())
+    fixed = _fix_all(chain)
     motion = replace(data, current=None)
     noise = [Noise.white(1e-3 * float(np.nanstd(data.motion)) or 1.0)]
     initial = data.initial
@@ -300,7 +328,7 @@ def simulate_freely(data: Data, chain: Chain, scales: Scales) -> Array:
     return linearise(motion, fixed, scales, initial, noise).simulated[0]
 
 
-def fit_noises(data: Data, linear: Linear, max_order: int = MAX_ORDER) -> list[Noise]:
+def fit_noises(data: Data, simulated: tuple[Array, ...], max_order: int = MAX_ORDER) -> list[Noise]:
     """Return the noise of every output by its residual."""
-    every = zip(data.outputs, linear.simulated, data.known, data.runs, strict=True)
+    every = zip(data.outputs, simulated, data.known, data.runs, strict=True)
     return [fit_noise((y - x)[known], runs, max_order) for y, x, known, runs in every]

@@ -117,6 +117,14 @@ def linearise(
     data: Data, chain: Chain, scales: Scales, initial: Array, noise: Sequence[Noise]
 ) -> Linear:
     """Return whitened residuals and derivatives of a chain."""
+    simulated, derivatives = differentiate(data, chain, scales, initial)
+    return whiten(data, chain, scales, initial, noise, simulated, derivatives, True)
+
+
+def differentiate(
+    data: Data, chain: Chain, scales: Scales, initial: Array
+) -> tuple[tuple[Array, ...], tuple[Array, ...]]:
+    """Return the outputs of a chain and their derivatives by parameters and initial states."""
     free = chain.free
     p = len(free)
     # The base, each parameter, then q and w of the segments unless all begin at rest.
@@ -145,8 +153,7 @@ def linearise(
         lines[: count - 1] /= difference[: count - 1, None]
         lines[p + 2] = 1.0 if data.is_angle and k == 0 else 0.0
         derivatives.append(lines)
-    simulated = tuple(predicted[0].copy() for predicted in outputs)
-    return whiten(data, chain, scales, initial, noise, simulated, tuple(derivatives), True)
+    return tuple(predicted[0].copy() for predicted in outputs), tuple(derivatives)
 
 
 def whiten(
@@ -195,7 +202,7 @@ def reuse_derivatives(
     data: Data, chain: Chain, scales: Scales, initial: Array, noise: Sequence[Noise], like: Linear
 ) -> Linear:
     """Return the residuals of a chain with the derivatives of another near it."""
-    simulated = _simulate(data, chain, scales, initial)
+    simulated = simulate_outputs(data, chain, scales, initial)
     pull = _compute_state_prior_gradient(scales, initial)
     prior = build_prior_rows(chain, scales)[0]
     return like.with_misfit(_whiten_misfit(data, noise, simulated), pull, prior, simulated, False)
@@ -208,7 +215,7 @@ def compute_residual(
 
     Initial states are fitted by the derivatives of another.
     """
-    misfit = _whiten_misfit(data, noise, _simulate(data, chain, scales, initial))
+    misfit = _whiten_misfit(data, noise, simulate_outputs(data, chain, scales, initial))
     if np.isfinite(data.huber):
         misfit *= _compute_huber_weights(misfit, data.huber)
     found = like.fit_states(misfit, _compute_state_prior_gradient(scales, initial))
@@ -271,7 +278,7 @@ def _simulate_lanes(
     return [got.motion.T] if got.current is None else [got.motion.T, got.current.T]
 
 
-def _simulate(data: Data, chain: Chain, scales: Scales, initial: Array) -> tuple[Array, ...]:
+def simulate_outputs(data: Data, chain: Chain, scales: Scales, initial: Array) -> tuple[Array, ...]:
     """Return every output of a chain, shape (n,)."""
     values = {p.name: np.array([chain.values[p.name]]) for p in chain.parameters}
     return tuple(

@@ -21,6 +21,7 @@ from smp_motor_control.arrays import Array, Integers
 from smp_motor_ident._compile import compiled
 
 MAX_ORDER = 24
+MAX_USELESS_ORDERS = 8  # tried beyond the best one
 MIN_VARIANCE = 1e-300
 
 
@@ -56,6 +57,11 @@ class Noise:
         """Return lines of shape (c, n) whitened."""
         return _whiten_lines(lines, runs, self.predictors, self.deviation)
 
+    def deviance(self, residual: Array, runs: Integers) -> float:
+        """Return -2 log likelihood of a residual of shape (n,), up to a constant."""
+        white = self.whiten(residual[None], runs)[0]
+        return float(white @ white) + self.log_determinant(runs)
+
     def log_determinant(self, runs: Integers) -> float:
         """Return the logarithm of the determinant of the noise's covariance over all runs."""
         length = runs[:, 1] - runs[:, 0]
@@ -78,12 +84,7 @@ def fit_noise(residual: Array, runs: Integers, max_order: int = MAX_ORDER) -> No
     """Return the noise that a residual shows, shape (n,)."""
     count = int((runs[:, 1] - runs[:, 0]).sum())
     max_order = max(0, min(max_order, count // 20))
-    reflection, variance = _estimate_reflections(residual, runs, max_order)
-    # Below its rounding a residual tells nothing.
-    floor = max(MIN_VARIANCE, 1e-26 * float(variance[0]))
-    variance = np.maximum(variance, floor)
-    orders = np.arange(max_order + 1)
-    best = int(np.argmin(count * np.log(variance) + math.log(max(count, 2)) * orders))
+    reflection, variance, best = _estimate_reflections(residual, runs, max_order)
     predictors = np.zeros((best + 1, best))
     for m in range(1, best + 1):
         k = reflection[m - 1]
@@ -100,8 +101,10 @@ def fit_noise(residual: Array, runs: Integers, max_order: int = MAX_ORDER) -> No
 
 
 @compiled
-def _estimate_reflections(residual: Array, runs: Integers, max_order: int) -> tuple[Array, Array]:
-    """Return reflection coefficients and the variance of the prediction's error of every order."""
+def _estimate_reflections(
+    residual: Array, runs: Integers, max_order: int
+) -> tuple[Array, Array, int]:
+    """Return reflection coefficients, variance of every order's error, and the best order."""
     forward, backward = residual.copy(), residual.copy()
     reflection, variance = np.zeros(max_order), np.zeros(max_order + 1)
     count, total, product, energy = 0, 0.0, 0.0, 0.0
@@ -114,10 +117,19 @@ def _estimate_reflections(residual: Array, runs: Integers, max_order: int) -> tu
             energy += residual[k] * residual[k] + residual[k - 1] * residual[k - 1]
         count += last - first
     variance[0] = total / max(count, 1)
+    # Below its rounding a residual tells nothing.
+    floor = max(MIN_VARIANCE, 1e-26 * variance[0])
+    variance[0] = max(variance[0], floor)
+    price, best, lowest = math.log(max(count, 2)), 0, count * math.log(variance[0])
     for m in range(1, max_order + 1):
         c = 2.0 * product / energy if energy > 0.0 else 0.0
         reflection[m - 1] = c
-        variance[m] = variance[m - 1] * max(1.0 - c * c, 1e-15)
+        variance[m] = max(variance[m - 1] * max(1.0 - c * c, 1e-15), floor)
+        criterion = count * math.log(variance[m]) + price * m
+        if criterion < lowest:
+            best, lowest = m, criterion
+        if m == best + MAX_USELESS_ORDERS:
+            break
         product = forward_energy = backward_energy = 0.0
         for r in range(runs.shape[0]):
             last = runs[r, 1]
@@ -132,7 +144,7 @@ def _estimate_reflections(residual: Array, runs: Integers, max_order: int) -> tu
                     backward_energy += backward[k - 1] * backward[k - 1]
                 b = after
         energy = forward_energy + backward_energy
-    return reflection, variance
+    return reflection, variance, best
 
 
 @compiled

@@ -364,7 +364,7 @@ def fit_alternative(data: Data, chain: Chain, like: Fit) -> Fit | None:
 
 def _refit_noise(data: Data, found: Fit) -> Fit:
     """Return the fit under the noise of its own residual."""
-    noise = fit_noises(data, found.linear, SEARCH_ORDER)
+    noise = fit_noises(data, found.linear.simulated, SEARCH_ORDER)
     return found.with_noise(data, noise).descend(data, SEARCH_TOLERANCE, 8)
 
 
