@@ -306,24 +306,37 @@ def _advance_tabulated(
 
     Return the next piece, q, w and th.
     """
-    for i in range(j, end):
+    drives, speeds, angles = out[0], out[1], out[2]
+    i = j
+    while i < end:
         kind = group[i]
         if kind < 0:
-            return i, q, w, th
+            break
         h = length[i] + edges[i] * shift
-        if h > 0.0:
+        if h <= 0.0:
+            drives[row[i]], speeds[row[i]], angles[row[i]] = q, w, th
+            i += 1
+            continue
+        t = tables[kind]
+        qq, qw, qv, qf = t[0], t[1], t[2], t[3] * f
+        wq, ww, wv, wf = t[4], t[5], t[6], t[7] * f
+        tq, tw, tv, tf = t[8], t[9], t[10], t[11] * f
+        while i < end and group[i] == kind:
             v = voltage[section[i]]
-            q1, w1, turned = _apply_transition(tables, kind, q, w, v, f)
+            q1, w1 = qq * q + qw * w + (qv * v + qf), wq * q + ww * w + (wv * v + wf)
             if direction != STUCK_DIRECTION and (
                 w1 * direction <= 0.0
                 or (has_lag and (tm * w + h * (q - be * w - f)) * direction <= 0.0)
             ):
                 return i, q, w, th
-            q, w, th = q1, w1, th + turned
+            th += tq * q + tw * w + (tv * v + tf)
+            q, w = q1, w1
             if volts.shape[0] > 0:
                 volts[row[i]] += h * v
-        out[0, row[i]], out[1, row[i]], out[2, row[i]] = q, w, th
-    return end, q, w, th
+            k = row[i]
+            drives[k], speeds[k], angles[k] = q, w, th
+            i += 1
+    return i, q, w, th
 
 
 @inlined

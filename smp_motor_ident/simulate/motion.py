@@ -27,7 +27,15 @@ class Motion:
     speed: Array  # [rad/s]
     angle: Array  # [rad]
     charge: Array  # integral of q [V s], shape (0, lanes) where it was not asked for
-    duty: Array  # voltage of the row over full duty, shape (n, 1)
+    command: Array  # [V], shape (sections, lanes) or (sections, 1)
+    pieces: Pieces
+    full_duty: float  # [V]
+
+    @property
+    def duty(self) -> Array:
+        """Voltage of the row over full duty, shape (n, 1)."""
+        last = np.maximum(self.pieces.first[1:] - 1, 0)
+        return self.command[self.pieces.section[last], :1] / self.full_duty
 
 
 def follows_motion(lanes: Array) -> bool:
@@ -98,6 +106,4 @@ def simulate(
         put = np.cumsum(volts, axis=1)
         gathered = put - put[:, first] - lanes[at.TE, :, None] * (drive - drive[:, first])
         gathered -= lanes[at.K, :, None] * (angle - angle[:, first])
-    last = np.maximum(pieces.first[1:] - 1, 0)
-    duty = command[pieces.section[last], :1] / full_duty
-    return Motion(drive.T, speed.T, angle.T, gathered.T, duty)
+    return Motion(drive.T, speed.T, angle.T, gathered.T, command, pieces, full_duty)
