@@ -99,11 +99,12 @@ def _estimate_group(group: list[Record], request: Request, found: Sequence[Findi
     best = _fit_best_chain(data, request)
     levels = detect_levels(data)
     hardware = group[0].hardware
-    parts = collect_contributions(data, best, levels, hardware.timing_accuracy)
+    scatters = compute_scatters(data, best)
+    parts = collect_contributions(data, best, levels, scatters, hardware.timing_accuracy)
     result = state_quantities(data, best, parts, levels, hardware, request.known)
     request.say("validating")
     context = EstimateContext(
-        group, data, best, parts, compute_scatters(data, best), levels, result,
+        group, data, best, parts, scatters, levels, result,
         compute_fit_percents(group, data, best, request.validation), check_residuals(data, best),
         request.known,
     )  # fmt: skip

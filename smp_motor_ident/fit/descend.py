@@ -118,8 +118,7 @@ def descend(
         step = _compute_step(linear, at, scales, damping)
         if not np.isfinite(step).all():
             break
-        trial = at.with_values(_apply_step(at, scales, step))
-        taken = np.array([trial.values[p.name] - at.values[p.name] for p in at.free])
+        trial, taken = _apply_step(at, scales, step)
         expected = float(taken @ (2 * linear.gradient - linear.normal @ taken))
         least = tolerance * min(linear.cost / linear.data.row.size, 1.0)
         if 0 <= expected < NEGLIGIBLE_GAIN * least:
@@ -207,13 +206,13 @@ def _find_longest_log_step(chain: Chain, step: Array) -> float:
     return max((abs(float(s)) for s, p in every if p.unit == "ln"), default=0.0)
 
 
-def _apply_step(chain: Chain, scales: Scales, step: Array) -> dict[str, float]:
-    """Return values after a step, within their bounds."""
-    out = {}
-    for s, p in zip(step, chain.free, strict=True):
-        low, high = p.bounds(scales)
-        out[p.name] = float(min(max(chain.values[p.name] + s, low), high))
-    return out
+def _apply_step(chain: Chain, scales: Scales, step: Array) -> tuple[Chain, Array]:
+    """Return the chain after a step within the bounds, and the step that was taken."""
+    limits = np.array([p.bounds(scales) for p in chain.free])
+    begun = np.array([chain.values[p.name] for p in chain.free])
+    ended = np.clip(begun + step, limits[:, 0], limits[:, 1])
+    values = {p.name: float(x) for p, x in zip(chain.free, ended, strict=True)}
+    return chain.with_values(values), ended - begun
 
 
 def approach(

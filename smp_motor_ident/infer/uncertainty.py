@@ -12,7 +12,7 @@ A recording with few sizes or directions of voltage leaves more of them open.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -22,7 +22,7 @@ from smp_motor_ident.chain.chain import Chain
 from smp_motor_ident.chain.component import Component
 from smp_motor_ident.chain.motor import Delay, Friction
 from smp_motor_ident.chain.quantities import REPORTED
-from smp_motor_ident.fit.adequacy import compute_scatters
+from smp_motor_ident.fit.adequacy import Scatter
 from smp_motor_ident.fit.data import MIN_SEARCH_ROWS, Data
 from smp_motor_ident.fit.descend import Fit, evaluate_on_rows
 from smp_motor_ident.fit.search import (
@@ -126,7 +126,11 @@ class Contribution:
 
 
 def collect_contributions(
-    data: Data, found: Fit, levels: Levels, timing: float | None = None
+    data: Data,
+    found: Fit,
+    levels: Levels,
+    scatters: Sequence[Scatter],
+    timing: float | None = None,
 ) -> list[Contribution]:
     """Collect all parts of the uncertainty; their sum does not depend on their order.
 
@@ -135,7 +139,7 @@ def collect_contributions(
     parts = [*assess_noise(found), *assess_priors(found), *assess_thresholds(data, found)]
     if levels.steady and "vc" in found.names:
         parts.append(assess_one_level(found))
-    for one in compute_scatters(data, found):
+    for one in scatters:
         if one.significant:
             parts.append(Contribution(one.name, one.excess))
     some = data.thin(MIN_SEARCH_ROWS)

@@ -6,7 +6,6 @@ import math
 import os
 import re
 import signal
-import time
 import uuid
 from collections.abc import Iterator
 from pathlib import Path
@@ -22,8 +21,8 @@ from smp_motor_ident.cli.applying import from_file
 
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "tutorial" / "simulated-robot.md"
 
-LIMIT = 150.0
-"""Longest time of the demo [s] on two free cores."""
+OF_DRIVE = re.compile(r"forward|reverse|overshoot|settling")
+"""Lines on the drive, which the demo does not judge where the machine delays its samples."""
 
 
 def find_processes(mark: str) -> list[int]:
@@ -58,6 +57,8 @@ def assert_page_shows(output: str, *, idle: bool) -> None:
              if line.strip()]  # fmt: skip
     fresh[0] = f"Front left: {fresh[0]}"
     fresh += [line for line in output.splitlines() if line.startswith("ok ")]
+    if "the drive is not judged" in output:
+        shown, fresh = ([x for x in lines if not OF_DRIVE.search(x)] for lines in (shown, fresh))
     for a, b in zip(shown, fresh, strict=True):
         # The wheel nearest to a limit is random, and so are small systematic errors.
         where = re.compile(r" \((-|\w+( \w+)?)\)$|(?<=^systematic: ).*")
@@ -84,13 +85,9 @@ def assert_page_shows(output: str, *, idle: bool) -> None:
 @pytest.mark.slow
 def test_demo_output_matches_its_page_and_no_process_remains(process, mark, tmp_path):
     idle = os.getloadavg()[0] < 1.0
-    begun = time.monotonic()
     demo = process("demo", "--output", "result", env={"SMP_MARK": mark})
-    code = demo.wait(4 * LIMIT)
-    took = time.monotonic() - begun
-    assert code == 0, demo.output
+    assert demo.wait(600.0) == 0, demo.output
     assert find_processes(mark) == []
-    assert took < LIMIT or not idle
     result = tmp_path / "result"
     assert (result / "identification" / "report.html").stat().st_size > 100_000
     assert set(load_motors(result / "identification" / "motors.yaml")) == set(WHEELS)
