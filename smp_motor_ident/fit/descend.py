@@ -116,12 +116,10 @@ def descend(
     moved, damping = 0.0, 1e-4  # of a logarithm since derivatives were taken
     for _ in range(max_steps if at.free else 0):
         step = _compute_step(linear, at, scales, damping)
-        if not np.isfinite(step).all():
-            break
         trial, taken = _apply_step(at, scales, step)
         expected = float(taken @ (2 * linear.gradient - linear.normal @ taken))
         least = tolerance * min(linear.cost / linear.data.row.size, 1.0)
-        if 0 <= expected < NEGLIGIBLE_GAIN * least:
+        if not np.isfinite(step).all() or 0 <= expected < NEGLIGIBLE_GAIN * least:
             break
         fold = _find_longest_log_step(at, taken)
         place = data, trial, scales, update_initial_states(start, linear, taken), noise
