@@ -245,10 +245,10 @@ def simulate_rows(  # noqa: C901 - one pass, kept whole so that nothing is store
             while j < end:
                 moving = not friction or direction != STUCK_DIRECTION
                 dry = plus if direction > 0.0 else -minus if direction < 0.0 else 0.0
-                if moving and not feedback and group[j] >= 0:
-                    j, q, w, th = _advance_tabulated(
+                if moving and not feedback:
+                    j, q, w, th = _advance_in_motion(
                         j, end, q, w, th, load + dry, direction if friction else STUCK_DIRECTION,
-                        tm, be, te > 0.0, group, section, row, length, edges, shift[b], voltage,
+                        te, tm, k, be, group, section, row, length, edges, shift[b], voltage,
                         tables[b], out[:, b], volts[b],
                     )  # fmt: skip
                     if j == end:
@@ -297,46 +297,30 @@ def simulate_rows(  # noqa: C901 - one pass, kept whole so that nothing is store
 
 
 @compiled
-def _advance_tabulated(
-    j: int, end: int, q: float, w: float, th: float, f: float, direction: float, tm: float,
-    be: float, has_lag: bool, group: Integers, section: Integers, row: Integers, length: Array,
-    edges: Integers, shift: float, voltage: Array, tables: Array, out: Array, volts: Array,
+def _advance_in_motion(
+    j: int, end: int, q: float, w: float, th: float, f: float, direction: float, te: float,
+    tm: float, k: float, be: float, group: Integers, section: Integers, row: Integers,
+    length: Array, edges: Integers, shift: float, voltage: Array, table: Array, out: Array,
+    volts: Array,
 ) -> tuple[int, float, float, float]:  # fmt: skip
-    """Advance through pieces whose transitions are tabulated, up to an event of friction.
-
-    Return the next piece, q, w and th.
-    """
+    """Advance through pieces up to an event of friction; return the next piece, q, w and th."""
     drives, speeds, angles = out[0], out[1], out[2]
-    i = j
-    while i < end:
-        kind = group[i]
-        if kind < 0:
-            break
+    for i in range(j, end):
         h = length[i] + edges[i] * shift
-        if h <= 0.0:
-            drives[row[i]], speeds[row[i]], angles[row[i]] = q, w, th
-            i += 1
-            continue
-        t = tables[kind]
-        qq, qw, qv, qf = t[0], t[1], t[2], t[3] * f
-        wq, ww, wv, wf = t[4], t[5], t[6], t[7] * f
-        tq, tw, tv, tf = t[8], t[9], t[10], t[11] * f
-        while i < end and group[i] == kind:
+        if h > 0.0:
             v = voltage[section[i]]
-            q1, w1 = qq * q + qw * w + (qv * v + qf), wq * q + ww * w + (wv * v + wf)
+            q1, w1, turned = _advance_piece(table, group[i], q, w, h, v, f, te, tm, k, be)
             if direction != STUCK_DIRECTION and (
                 w1 * direction <= 0.0
-                or (has_lag and (tm * w + h * (q - be * w - f)) * direction <= 0.0)
+                or (te > 0.0 and (tm * w + h * (q - be * w - f)) * direction <= 0.0)
             ):
                 return i, q, w, th
-            th += tq * q + tw * w + (tv * v + tf)
-            q, w = q1, w1
+            q, w, th = q1, w1, th + turned
             if volts.shape[0] > 0:
                 volts[row[i]] += h * v
-            k = row[i]
-            drives[k], speeds[k], angles[k] = q, w, th
-            i += 1
-    return i, q, w, th
+        at = row[i]
+        drives[at], speeds[at], angles[at] = q, w, th
+    return end, q, w, th
 
 
 @inlined
