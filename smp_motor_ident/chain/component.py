@@ -113,9 +113,7 @@ class Component:
         """
         if not self.lag or "ln_a2" not in values:
             return {}
-        first = math.exp(values["ln_a1"] - values["ln_a0"])
-        product = math.exp(values["ln_a2"] - values["ln_a0"])
-        second = 0.5 * (first - math.sqrt(max(first**2 - 4 * product, 0.0)))
+        first, second = compute_lags(values)
         if second < MIN_SECOND_LAG_SHARE * first or second > 0.9 * first:
             return {}
         rest = max(first - second, 0.1 * first)
@@ -124,6 +122,13 @@ class Component:
             self.lag: values.get(self.lag, 0.0) + second / self.lateness, "ln_a1": ln_a1,
             "ln_a2": ln_a1 + math.log(0.01 * rest),
         }  # fmt: skip
+
+
+def compute_lags(values: Mapping[str, float]) -> tuple[float, float]:
+    """Return the sum of a motor's lags and the shorter one [s]."""
+    first = math.exp(values["ln_a1"] - values["ln_a0"])
+    product = math.exp(values["ln_a2"] - values["ln_a0"]) if "ln_a2" in values else 0.0
+    return first, 0.5 * (first - math.sqrt(max(first**2 - 4 * product, 0.0)))
 
 
 class Sensor(Component):

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from typing import ClassVar
 
@@ -10,7 +11,14 @@ import numpy as np
 
 from smp_motor_control.arrays import Array, Integers
 from smp_motor_ident._compile import compiled
-from smp_motor_ident.chain.component import Parameter, Scales, Sensor, Values
+from smp_motor_ident.chain.component import (
+    MIN_SECOND_LAG_SHARE,
+    Parameter,
+    Scales,
+    Sensor,
+    Values,
+    compute_lags,
+)
 from smp_motor_ident.simulate.motion import Motion
 from smp_motor_ident.simulate.rows import Rows
 
@@ -96,6 +104,20 @@ class LowPassedSpeed(Sensor):
     def sense(self, p: Values, motion: Motion, rows: Rows, scales: Scales) -> Array:
         """Return ``s`` of ``lag s' = w - s``."""
         return _low_pass(rows.time, rows.segment, motion.speed, motion.angle, p["sensor_lag"])
+
+    def exchange_lags(self, values: Mapping[str, float]) -> Mapping[str, float]:
+        """Return values of a chain in which the sensor has the motor's longer lag.
+
+        Only friction, which acts before the sensor, tells one from the other.
+        """
+        lags, second = compute_lags(values)
+        other = values.get("sensor_lag", second)
+        if other < MIN_SECOND_LAG_SHARE * lags:
+            return {}
+        ln_a1 = values["ln_a0"] + math.log(other)
+        return {
+            "sensor_lag": lags - second, "ln_a1": ln_a1, "ln_a2": ln_a1 + math.log(0.01 * other),
+        }  # fmt: skip
 
 
 class Current(Sensor):

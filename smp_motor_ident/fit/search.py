@@ -25,7 +25,7 @@ from smp_motor_ident.chain.catalogue import (
 )
 from smp_motor_ident.chain.chain import Chain, respond
 from smp_motor_ident.chain.component import Component
-from smp_motor_ident.chain.sensor import Angle, DifferencedSpeed, Speed
+from smp_motor_ident.chain.sensor import Angle, DifferencedSpeed, LowPassedSpeed, Speed
 from smp_motor_ident.errors import CurrentError, InsufficientExcitationError
 from smp_motor_ident.fit.adequacy import compute_scatters, leaves_only_rounding
 from smp_motor_ident.fit.data import Data
@@ -379,9 +379,10 @@ def _fit_best_candidate(
     """Fit the promising candidates; return the best net gain and its fit."""
     best: tuple[float, Fit] | None = None
     promising = [c for c in screened[: policy.max_candidates] if c.gain > 0.5 * c.price]
+    alternatives = [*replace_second_lag(found, data), *(exchange_lags(found) if promising else ())]
     others = [
         Candidate(chain, one, math.nan, policy.price(one, 100.0))
-        for one, chain in replace_second_lag(found, data)
+        for one, chain in alternatives
         if not found.chain.has(one.code)
     ]
     for candidate in (*promising, *others):
@@ -408,6 +409,16 @@ def replace_second_lag(found: Fit, data: Data) -> Iterator[tuple[Component, Chai
         values = one.replace_second_lag(found.chain.values)
         if values:
             yield one, found.chain.with_component(one, values)
+
+
+def exchange_lags(found: Fit) -> Iterator[tuple[Component, Chain]]:
+    """Yield the chain in which a low-pass of the speed has the motor's longer lag."""
+    one, chain = LowPassedSpeed(), found.chain
+    sensor = chain.sensor("speed sensor")
+    if sensor is not None and sensor.code in ("speed", one.code) and "ln_a2" in chain.values:
+        values = one.exchange_lags(chain.values)
+        if values:
+            yield one, chain.with_component(one, values)
 
 
 def _list_optional_components(found: Fit, data: Data) -> Iterator[tuple[Component, Chain]]:

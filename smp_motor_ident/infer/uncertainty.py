@@ -22,12 +22,14 @@ from smp_motor_ident.chain.chain import Chain
 from smp_motor_ident.chain.component import Component
 from smp_motor_ident.chain.motor import Delay, Friction
 from smp_motor_ident.chain.quantities import REPORTED
+from smp_motor_ident.chain.sensor import LowPassedSpeed
 from smp_motor_ident.fit.adequacy import Scatter
 from smp_motor_ident.fit.data import MIN_SEARCH_ROWS, Data
 from smp_motor_ident.fit.descend import Fit, evaluate_on_rows
 from smp_motor_ident.fit.search import (
     SelectionPolicy,
     compute_relative_prior_std,
+    exchange_lags,
     fit_alternative,
     list_candidates,
     replace_second_lag,
@@ -221,21 +223,26 @@ def assess_second_lag_alternatives(data: Data, found: Fit) -> Iterator[Contribut
 
     Both fit nearly alike with distant parameters, so derivatives do not show it.  The other is
     weighted by its prior and by the ratio of the likelihoods.  Where the chain has the component
-    already, the deviance between both replaces that of the quadratic approximation.
+    already, the deviance between both replaces that of the quadratic approximation.  A low-pass may
+    also exchange its lag with the motor.
     """
-    for one, chain in replace_second_lag(found, data):
-        values = found.chain.values
+    values = found.chain.values
+    others = [(one, chain, False) for one, chain in replace_second_lag(found, data)]
+    if found.chain.has(LowPassedSpeed.code):
+        others += [(one, chain, True) for one, chain in exchange_lags(found)]
+    for one, chain, exchanged in others:
         least = min(chain.values["ln_a2"], values["ln_a2"] + math.log(MAX_LEFT_SECOND_LAG))
         other = fit_alternative(data, chain.with_values({"ln_a2": least}), found)
         if other is None:
             continue
         difference = other.linear.cost - found.linear.cost
         change = np.array([other.chain.values.get(n, 0.0) - values[n] for n in found.names])
-        if found.chain.has(one.code):
+        if found.chain.has(one.code) and not exchanged:
             quadratic = float(change @ found.linear.normal @ change)
             weight = math.sqrt(max(1 / max(difference, 1.0) - 1 / max(quadratic, 1.0), 0.0))
         else:
-            odds = one.prior / (1 - one.prior) * math.exp(min(-0.5 * difference, 50.0))
+            odds = 1.0 if exchanged else one.prior / (1 - one.prior)
+            odds *= math.exp(min(-0.5 * difference, 50.0))
             weight = math.sqrt(odds / (1 + odds))
         units = np.array([p.unit for p in found.chain.free])
         change = np.where(units == "ln", np.expm1(change), change)

@@ -64,6 +64,23 @@ def test_once_per_turn_encoder_error_is_estimated(error):
     motors.check(found, truth, ("dc_gain", "time_constant", "static_voltage"))
 
 
+@pytest.mark.parametrize("ratio", [0.2, 4.0])
+def test_low_pass_of_the_speed_is_told_from_the_motor_by_friction(ratio):
+    t = np.arange(3000) / 200
+    voltage = np.repeat(np.random.default_rng(2).uniform(-9.0, 9.0, 60), 50)
+    r, inductance, k, j, b = TABLE_1["rear_left"]
+    speed = simulate(t, voltage, r, inductance, k, j, b, 0.3 * k / r, 0 * t, 10)[:, 1]
+    truth = motors.truth("rear_left", 0.3)
+    lag = ratio * truth["time_constant"]
+    shown = lsim(([1.0], [lag, 1.0]), speed, t)[1]
+    shown += 0.2 * np.random.default_rng(3).standard_normal(t.size)
+    found = estimate(Record("motor", t, voltage, velocity=shown))
+    assert "low_passed_speed" in found.chain.components
+    assert "dead_zone" not in found.chain.components
+    motors.check(found, truth, ("dc_gain", "time_constant", "static_voltage"))
+    assert found.value("time_constant") == pytest.approx(truth["time_constant"], rel=0.03)
+
+
 COMMAND_RATE = 200.0
 FINER = 20  # steps of the driver's clock per sample
 
