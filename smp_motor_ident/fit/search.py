@@ -156,27 +156,46 @@ def _is_fixed(one: Component, chain: Chain) -> bool:
     return any(p.name in chain.fixed for p in one.parameters)
 
 
-def screen_candidates(found: Fit, data: Data, policy: SelectionPolicy) -> list[Candidate]:
-    """Return all candidates with their expected gains, the best first."""
-    m = found.linear.data.row.size
-    columns = found.linear.columns[:m]
-    base = found.linear.residual[:m]
-    best: dict[str, Candidate] = {}
+@dataclass(frozen=True, eq=False)
+class Effect:
+    """What an absent component of some size would change."""
+
+    component: Component
+    chain: Chain
+    shift: Array  # shape (p,): change of the parameters, which take up a part of it
+    rest: Array  # shape (m + priors,): change of the residual that is left
+    energy: float  # sum of squares of that
+    optimum: float  # size at which the residual is smallest, over this size
+    prior_std: float  # standard deviation of the size before the data are seen, over this size
+
+
+def measure_effects(found: Fit, data: Data) -> Iterator[Effect]:
+    """Simulate every absent component at each of its starts."""
+    columns, base = found.linear.columns, found.linear.residual
+    signature = np.zeros(base.size)
     for one, chain in list_candidates(found, data):
         r = found.residual(data, chain)
-        if r is None:
-            continue
-        # The other parameters absorb part of the change, within their priors.
-        signature = r - base
-        signature -= columns @ (found.covariance @ (columns.T @ signature))
-        rest = base + signature
-        energy = float(signature @ signature)
-        price = policy.price(one, _prior_to_data_variance_ratio(one, chain, found, energy))
-        gain = compute_gain(data, found.linear, rest)
-        share = -float(signature @ base) / energy if energy > 0 else 0.0
-        scaled = _scale_to_optimum(one, chain, found, share)
+        if r is not None:
+            signature[: r.size] = r - base[: r.size]
+            shift = found.covariance @ (columns.T @ signature)
+            rest = signature - columns @ shift
+            energy = float(rest @ rest)
+            optimum = -float(rest @ base) / energy if energy > 0 else 0.0
+            prior_std = _compute_relative_prior_std(one, chain, found)
+            yield Effect(one, chain, shift, rest, energy, optimum, prior_std)
+
+
+def screen_candidates(found: Fit, data: Data, policy: SelectionPolicy) -> list[Candidate]:
+    """Return all candidates with their expected gains, the best first."""
+    base = found.linear.residual
+    best: dict[str, Candidate] = {}
+    for effect in measure_effects(found, data):
+        one, chain = effect.component, effect.chain
+        price = policy.price(one, effect.energy * effect.prior_std**2)
+        gain = compute_gain(data, found.linear, base + effect.rest)
+        scaled = _scale_to_optimum(one, chain, found, effect.optimum)
         if scaled is not None:
-            along = compute_gain(data, found.linear, base + share * signature)
+            along = compute_gain(data, found.linear, base + effect.optimum * effect.rest)
             if along > gain:
                 gain, chain = along, scaled
         if one.code not in best or gain > best[one.code].gain:
@@ -184,13 +203,7 @@ def screen_candidates(found: Fit, data: Data, policy: SelectionPolicy) -> list[C
     return sorted(best.values(), key=lambda c: c.price - c.gain)
 
 
-def _prior_to_data_variance_ratio(one: Component, chain: Chain, found: Fit, energy: float) -> float:
-    """Return the prior variance of a component's size over that given by the data."""
-    unit = compute_relative_prior_std(one, chain, found)
-    return energy * unit**2
-
-
-def compute_relative_prior_std(one: Component, chain: Chain, found: Fit) -> float:
+def _compute_relative_prior_std(one: Component, chain: Chain, found: Fit) -> float:
     """Return the prior standard deviation of a component over its size in a chain."""
     new = next((p for p in one.parameters if p.name not in found.chain.values), None)
     if new is None or new.unit == "ln":

@@ -13,12 +13,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from smp_motor_control.arrays import Array
-from smp_motor_ident.chain.chain import Chain
 from smp_motor_ident.chain.component import Component
 from smp_motor_ident.chain.motor import Delay, Friction
 from smp_motor_ident.chain.quantities import REPORTED
@@ -27,11 +26,11 @@ from smp_motor_ident.fit.adequacy import Scatter
 from smp_motor_ident.fit.data import MIN_SEARCH_ROWS, Data
 from smp_motor_ident.fit.descend import Fit, evaluate_on_rows
 from smp_motor_ident.fit.search import (
+    Effect,
     SelectionPolicy,
-    compute_relative_prior_std,
     exchange_lags,
     fit_alternative,
-    list_candidates,
+    measure_effects,
     replace_second_lag,
 )
 from smp_motor_ident.limits import LEVEL_TOLERANCE, MAX_REST_VOLTAGE, TIMING_ACCURACY
@@ -267,38 +266,21 @@ def assess_absent_components(
     systematic: it changes the gain, and only details of transients would show it.  ``rows``: rows
     of the recording for each row of the data.
     """
-    policy = replace(SelectionPolicy(), extra_price=0.0)
     best: dict[str, tuple[float, float, Contribution]] = {}
-    for one, chain in list_candidates(found, data):
+    for effect in measure_effects(found, data):
+        one = effect.component
         hidden = one_size and one.slot in DRIVER_SLOTS
-        part = _assess_absent_component(one, chain, data, found, policy, rows, hidden)
-        small = compute_relative_prior_std(one, chain, found) if one.linear else 0.0
-        if part is not None and (one.code not in best or (small, part[0]) > best[one.code][:2]):
+        part = _weigh_effect(effect, rows, hidden)
+        small = effect.prior_std if one.linear else 0.0
+        if one.code not in best or (small, part[0]) > best[one.code][:2]:
             best[one.code] = small, *part
     return [part for *_, part in best.values()]
 
 
-def _assess_absent_component(
-    one: Component,
-    chain: Chain,
-    data: Data,
-    found: Fit,
-    policy: SelectionPolicy,
-    rows: float,
-    hidden: bool,
-) -> tuple[float, Contribution] | None:
-    r = found.residual(data, chain)
-    if r is None:
-        return None
-    base, m = found.linear.residual, found.linear.data.row.size
-    signature = np.concatenate([r - base[:m], np.zeros(base.size - m)])
-    columns = found.linear.columns
-    shift = found.covariance @ (columns.T @ signature)  # of the parameters, for this size
-    rest = signature - columns @ shift
-    energy = float(rest @ rest)  # of these rows
-    unit = compute_relative_prior_std(one, chain, found)
+def _weigh_effect(effect: Effect, rows: float, hidden: bool) -> tuple[float, Contribution]:
+    """Return the probability of an absent component and its contribution."""
+    one, energy, unit, optimum = effect.component, effect.energy, effect.prior_std, effect.optimum
     variance_ratio = rows * energy * unit**2
-    optimum = -float(rest @ base) / energy if energy > 0 else 0.0
     variance = 1 / (rows * energy + 1 / unit**2)
     size = optimum * energy / (energy + 1 / unit**2)
     if rows > 1.0:  # chance in fewer rows
@@ -306,16 +288,15 @@ def _assess_absent_component(
     gain = optimum**2 * energy
     if _is_one_sided(one) and optimum < 0:
         gain, size = 0.0, 0.0
-    price = policy.price(one, variance_ratio)
+    price = SelectionPolicy(extra_price=0.0).price(one, variance_ratio)
     weight = 1 / (1 + math.exp(min(max(0.5 * (price - gain), -50.0), 50.0)))
     shown = variance_ratio**2 / (MIN_SHOWN_VARIANCE_RATIO**2 + variance_ratio**2)
     spread = weight * shown * (size**2 + variance)
     hidden_variance = (1 - shown) * unit**2
     if hidden or weight < MIN_SUPPORTED_PROBABILITY:  # neither supported nor excluded
         spread, hidden_variance = 0.0, hidden_variance + spread
-    return weight, Contribution(
-        one.code, spread * np.outer(shift, shift), shift * math.sqrt(hidden_variance)
-    )
+    covariance = np.asarray(spread * np.outer(effect.shift, effect.shift), np.float64)
+    return weight, Contribution(one.code, covariance, effect.shift * math.sqrt(hidden_variance))
 
 
 def _is_one_sided(one: Component) -> bool:
