@@ -368,7 +368,7 @@ def fit_alternative(data: Data, chain: Chain, like: Fit) -> Fit | None:
     A second lag of the motor is added last: with it a distant fit would end at the other.
     """
     held = replace(chain, fixed=chain.fixed | {"ln_a2"})
-    begun = descend(data, held, like.scales, like.initial, like.noise, 4, 10 * SEARCH_TOLERANCE)
+    begun = descend(data, held, like.scales, like.initial, like.noise, 2, 10 * SEARCH_TOLERANCE)
     if begun.linear.cost > MAX_ALTERNATIVE_COST_RATIO * like.linear.cost:
         return None
     chain = replace(begun.chain, fixed=chain.fixed)
