@@ -382,13 +382,15 @@ def _refit_noise(data: Data, found: Fit) -> Fit:
 
 
 def _fit_best_addition(found: Fit, data: Data, policy: SelectionPolicy, say: Say) -> Fit | None:
-    best = _fit_best_candidate(found, data, screen_candidates(found, data, policy), policy, say)
+    screened = screen_candidates(found, data, policy)
+    best = _fit_best_candidate(found, data, screened, policy, say, with_alternatives=True)
     return None if best is None or best[0] <= 0 else _refit_noise(data, best[1])
 
 
 def _fit_best_candidate(
-    found: Fit, data: Data, screened: Sequence[Candidate], policy: SelectionPolicy, say: Say
-) -> tuple[float, Fit] | None:
+    found: Fit, data: Data, screened: Sequence[Candidate], policy: SelectionPolicy, say: Say,
+    with_alternatives: bool = False,
+) -> tuple[float, Fit] | None:  # fmt: skip
     """Fit the promising candidates; return the best net gain and its fit."""
     best: tuple[float, Fit] | None = None
     promising = [c for c in screened[: policy.max_candidates] if c.gain > 0.5 * c.price]
@@ -396,7 +398,7 @@ def _fit_best_candidate(
     others = [
         Candidate(chain, one, math.nan, policy.price(one, 100.0))
         for one, chain in alternatives
-        if not found.chain.has(one.code)
+        if with_alternatives and not found.chain.has(one.code)
     ]
     for candidate in (*promising, *others):
         if best is not None and candidate.gain < MIN_GAIN_RATIO * best[0]:
