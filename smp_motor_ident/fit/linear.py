@@ -162,12 +162,12 @@ def whiten(
 ) -> Linear:  # fmt: skip
     """Return the residuals and derivatives of a simulation under a noise model."""
     prior, rows, _ = build_prior_rows(chain, scales)
-    p, first = len(chain.free), 0
-    slopes = np.empty((p + 3, data.row.size))
-    for k, lines in enumerate(derivatives):
-        last = first + data.known[k].size
-        slopes[:, first:last] = noise[k].whiten(lines, _select_runs(data, k, noise[k]))
-        first = last
+    p = len(chain.free)
+    parts = [
+        its.whiten(lines, _select_runs(data, k, its))
+        for k, (its, lines) in enumerate(zip(noise, derivatives, strict=True))
+    ]
+    slopes = parts[0] if len(parts) == 1 else np.concatenate(parts, axis=1)
     misfit = _whiten_misfit(data, noise, simulated)
     if np.isfinite(data.huber):
         slopes *= _compute_huber_weights(misfit, data.huber)
