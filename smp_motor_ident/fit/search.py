@@ -146,14 +146,18 @@ def list_candidates(found: Fit, data: Data) -> Iterator[tuple[Component, Chain]]
     sensors = ANGLE_SENSORS if data.is_angle else SPEED_SENSORS
     currents = () if data.current is None else CURRENT_SENSORS
     for one in (*OPTIONAL, *sensors, *currents):
-        slots = {c.slot for c in found.chain.components if _is_fixed(c, found.chain)}
-        if not found.chain.has(one.code) and one.slot not in slots:
+        if not found.chain.has(one.code) and one.slot not in _list_fixed_slots(found.chain):
             for values in one.starts_in(found.chain.values, found.scales):
                 yield one, found.chain.with_component(one, values)
 
 
 def _is_fixed(one: Component, chain: Chain) -> bool:
     return any(p.name in chain.fixed for p in one.parameters)
+
+
+def _list_fixed_slots(chain: Chain) -> set[str]:
+    """Return the slots of components that a user has given."""
+    return {c.slot for c in chain.components if _is_fixed(c, chain)}
 
 
 @dataclass(frozen=True, eq=False)
@@ -422,17 +426,16 @@ def replace_second_lag(found: Fit, data: Data) -> Iterator[tuple[Component, Chai
     sensors = () if data.is_angle else SPEED_SENSORS
     for one in (*OPTIONAL, *sensors):
         values = one.replace_second_lag(found.chain.values)
-        if values:
+        if values and one.slot not in _list_fixed_slots(found.chain):
             yield one, found.chain.with_component(one, values)
 
 
 def exchange_lags(found: Fit) -> Iterator[tuple[Component, Chain]]:
     """Yield the chain in which a low-pass of the speed has the motor's longer lag."""
     one, chain = LowPassedSpeed(), found.chain
-    sensor = chain.sensor("speed sensor")
-    if sensor is not None and sensor.code in ("speed", one.code) and "ln_a2" in chain.values:
+    if (chain.has("speed") or chain.has(one.code)) and "ln_a2" in chain.values:
         values = one.exchange_lags(chain.values)
-        if values:
+        if values and one.slot not in _list_fixed_slots(chain):
             yield one, chain.with_component(one, values)
 
 

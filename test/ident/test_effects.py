@@ -64,21 +64,41 @@ def test_once_per_turn_encoder_error_is_estimated(error):
     motors.check(found, truth, ("dc_gain", "time_constant", "static_voltage"))
 
 
-@pytest.mark.parametrize("ratio", [0.2, 4.0])
-def test_low_pass_of_the_speed_is_told_from_the_motor_by_friction(ratio):
+REAR_LEFT = TABLE_1["rear_left"]
+
+
+def low_pass_speed(
+    ratio: float, friction: float = 0.3, inductance: float = REAR_LEFT[1]
+) -> tuple[Record, float]:
+    """Return a record of a speed behind a low-pass, and its lag [s]: a multiple of the motor's."""
     t = np.arange(3000) / 200
     voltage = np.repeat(np.random.default_rng(2).uniform(-9.0, 9.0, 60), 50)
-    r, inductance, k, j, b = TABLE_1["rear_left"]
-    speed = simulate(t, voltage, r, inductance, k, j, b, 0.3 * k / r, 0 * t, 10)[:, 1]
-    truth = motors.truth("rear_left", 0.3)
-    lag = ratio * truth["time_constant"]
+    r, _, k, j, b = REAR_LEFT
+    speed = simulate(t, voltage, r, inductance, k, j, b, friction * k / r, 0 * t, 10)[:, 1]
+    lag = ratio * motors.truth("rear_left", friction)["time_constant"]
     shown = lsim(([1.0], [lag, 1.0]), speed, t)[1]
     shown += 0.2 * np.random.default_rng(3).standard_normal(t.size)
-    found = estimate(Record("motor", t, voltage, velocity=shown))
+    return Record("motor", t, voltage, velocity=shown), lag
+
+
+@pytest.mark.parametrize("ratio", [0.2, 4.0])
+def test_low_pass_of_the_speed_is_told_from_the_motor_by_friction(ratio):
+    record, _ = low_pass_speed(ratio)
+    found, truth = estimate(record), motors.truth("rear_left", 0.3)
     assert "low_passed_speed" in found.chain.components
     assert "dead_zone" not in found.chain.components
     motors.check(found, truth, ("dc_gain", "time_constant", "static_voltage"))
     assert found.value("time_constant") == pytest.approx(truth["time_constant"], rel=0.03)
+
+
+def test_given_low_pass_of_the_speed_does_not_exchange_its_lag_with_the_motor():
+    # Without friction and a lag of the winding nothing tells one lag from the other.
+    record, lag = low_pass_speed(4.0, friction=0.0, inductance=1e-3)
+    found = estimate(record, fixed={"sensor_lag": lag}).combinations["time_constant"]
+    r, _, k, j, b = REAR_LEFT
+    assert found.value == pytest.approx((r * j + 1e-3 * b) / (r * b + k * k), rel=3e-3)
+    assert "low_passed_speed" not in [share.cause for share in found.systematic]
+    assert found.total_std < 0.2 * found.value
 
 
 COMMAND_RATE = 200.0
