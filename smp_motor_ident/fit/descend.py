@@ -26,7 +26,6 @@ from smp_motor_ident.fit.linear import (
     invert,
     linearise,
     reuse_derivatives,
-    simulate_outputs,
     update_initial_states,
     whiten,
 )
@@ -293,18 +292,14 @@ def constrain(data: Data, found: Fit, constraints: Sequence[Constraint]) -> Fit:
 
 
 def evaluate_on_rows(data: Data, found: Fit) -> Fit:
-    """Evaluate a fit on other rows of its recording, at the same values."""
-    chain, scales = found.chain, found.scales
-    white = tuple(Noise.white(float(np.nanstd(y)) or 1.0) for y in data.outputs)
-    simulated, derivatives = differentiate(data, chain, scales, data.initial)
-    states = tuple(slopes[-3:] for slopes in derivatives)
-    begun = whiten(data, _fix_all(chain), scales, data.initial, white, simulated, states, True)
-    initial = update_initial_states(data.initial, begun, np.zeros(0))
-    simulated = simulate_outputs(data, chain, scales, initial)
+    """Evaluate a fit on other rows of its recording, at the same values and initial states."""
+    chain, scales, initial = found.chain, found.scales, found.initial
+    simulated, derivatives = differentiate(data, chain, scales, initial)
     noise = tuple(fit_noises(data, simulated))
-    linear = whiten(data, chain, scales, initial, noise, simulated, derivatives, False)
-    deviance = _compute_deviance(data, linear, noise)
-    return replace(found, initial=initial, noise=noise, linear=linear, deviance=deviance)
+    linear = whiten(data, chain, scales, initial, noise, simulated, derivatives, True)
+    return replace(
+        found, noise=noise, linear=linear, deviance=_compute_deviance(data, linear, noise)
+    )
 
 
 def _fix_all(chain: Chain) -> Chain:

@@ -18,7 +18,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from smp_motor_control.arrays import Array, Integers
-from smp_motor_ident._compile import compiled
+from smp_motor_ident._compile import compiled, inlined
 
 MAX_ORDER = 24
 MAX_USELESS_ORDERS = 8  # tried beyond the best one
@@ -107,21 +107,22 @@ def _estimate_reflections(
     """Return reflection coefficients, variance of every order's error, and the best order."""
     forward, backward = residual.copy(), residual.copy()
     reflection, variance = np.zeros(max_order), np.zeros(max_order + 1)
-    count, total, product, energy = 0, 0.0, 0.0, 0.0
-    for r in range(runs.shape[0]):
-        first, last = runs[r, 0], runs[r, 1]
-        for k in range(first, last):
-            total += residual[k] * residual[k]
-        for k in range(first + 1, last):
-            product += residual[k] * residual[k - 1]
-            energy += residual[k] * residual[k] + residual[k - 1] * residual[k - 1]
+    count, total = 0, 0.0
+    for first, last in runs:
         count += last - first
+        total += np.dot(residual[first:last], residual[first:last])
     variance[0] = total / max(count, 1)
     # Below its rounding a residual tells nothing.
     floor = max(MIN_VARIANCE, 1e-26 * variance[0])
     variance[0] = max(variance[0], floor)
     price, best, lowest = math.log(max(count, 2)), 0, count * math.log(variance[0])
     for m in range(1, max_order + 1):
+        product = energy = 0.0
+        for first, last in runs:
+            if last - first > m:
+                f, b = forward[first + 1 : last - m + 1], backward[first : last - m]
+                product += np.dot(f, b)
+                energy += np.dot(f, f) + np.dot(b, b)
         c = 2.0 * product / energy if energy > 0.0 else 0.0
         reflection[m - 1] = c
         variance[m] = max(variance[m - 1] * max(1.0 - c * c, 1e-15), floor)
@@ -130,21 +131,18 @@ def _estimate_reflections(
             best, lowest = m, criterion
         if m == best + MAX_USELESS_ORDERS:
             break
-        product = forward_energy = backward_energy = 0.0
-        for r in range(runs.shape[0]):
-            last = runs[r, 1]
-            first = min(runs[r, 0] + m, last)
-            b = backward[first - 1]
-            for k in range(first, last):
-                f, after = forward[k], backward[k]
-                forward[k], backward[k] = f - c * b, b - c * f
-                if k > first:  # pairs of the next order
-                    product += forward[k] * backward[k - 1]
-                    forward_energy += forward[k] * forward[k]
-                    backward_energy += backward[k - 1] * backward[k - 1]
-                b = after
-        energy = forward_energy + backward_energy
+        for first, last in runs:
+            if last - first > m:
+                _raise_order(forward[first : last - m + 1], backward[first : last - m + 1], c)
     return reflection, variance, best
+
+
+@inlined
+def _raise_order(forward: Array, backward: Array, c: float) -> None:
+    """Compute the errors of the next order; a forward error moves to the row of its partner."""
+    for k in range(forward.size - 1):
+        f, b = forward[k + 1], backward[k]
+        forward[k], backward[k] = f - c * b, b - c * f
 
 
 @compiled
