@@ -421,8 +421,11 @@ def _fit_best_candidate(
 def replace_second_lag(found: Fit, data: Data) -> Iterator[tuple[Component, Chain]]:
     """Yield chains in which another component replaces the motor's second lag.
 
-    Derivatives do not show them: at the found values their effect equals that of more lag.
+    Derivatives do not show them: at the found values their effect equals that of more lag.  A
+    measured current shows that lag by itself.
     """
+    if data.current is not None:
+        return
     sensors = () if data.is_angle else SPEED_SENSORS
     for one in (*OPTIONAL, *sensors):
         values = one.replace_second_lag(found.chain.values)
