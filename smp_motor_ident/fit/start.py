@@ -26,7 +26,7 @@ FRICTIONS = (0.0, 0.04, 0.12, 0.3)  # of the largest command
 DELAYS = (0.0, 1.0, 3.0)  # rows
 LONG_DELAYS = (10.0, 20.0, 40.0, 80.0, 160.0, 320.0)  # rows
 MAX_GOOD_COST = 0.1  # unexplained share of the output; above it long delays are tried
-MAX_GRID_ROWS = 3000
+MAX_GRID_ROWS = 2000
 MIN_LOG_DISTANCE = 0.5  # between two starts
 
 
@@ -163,9 +163,9 @@ def _score_grid(
                 if data.is_angle:
                     x = np.diff(x, axis=0, prepend=np.nan) / interval[:, None]
                 x = x[ok]
-                gain = (x * speed[ok, None]).sum(axis=0)
-                gain /= np.maximum(np.square(x).sum(axis=0), 1e-300)
-                cost = np.square(speed[ok, None] - gain * x).sum(axis=0) / energy
+                inner = speed[ok] @ x
+                gain = inner / np.maximum(np.square(x).sum(axis=0), 1e-300)
+                cost = 1.0 - gain * inner / energy
                 for k in np.flatnonzero((gain > 0) & np.isfinite(cost)):
                     found = {n: float(v[k]) for n, v in values.items()}
                     found |= {"ln_a0": -math.log(gain[k]), "ln_a1": math.log(lags[k] / gain[k])}
