@@ -150,7 +150,7 @@ def differentiate(
         lines = np.zeros((p + 3, data.known[k].size))
         seen = _select_measured(data, k, predicted)
         np.subtract(seen[1:], seen[0], out=lines[: count - 1])
-        lines[: count - 1] /= difference[: count - 1, None]
+        lines[: count - 1] *= 1 / difference[: count - 1, None]
         lines[p + 2] = 1.0 if data.is_angle and k == 0 else 0.0
         derivatives.append(lines)
     return tuple(predicted[0].copy() for predicted in outputs), tuple(derivatives)

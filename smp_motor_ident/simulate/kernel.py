@@ -16,7 +16,7 @@ import math
 
 import numpy as np
 
-from smp_motor_control.arrays import Array, Integers
+from smp_motor_control.arrays import Array, Integers, Places
 from smp_motor_ident._compile import compiled, inlined
 from smp_motor_ident.simulate.driver import terminal_voltage
 from smp_motor_ident.simulate.force import extra_force
@@ -182,11 +182,11 @@ def _advance(
 @compiled
 def simulate_rows(  # noqa: C901 - one pass, kept whole so that nothing is stored between its steps
     first_piece: Integers,
-    row: Integers,
+    row: Places,
     length: Array,
     edges: Integers,
-    group: Integers,
-    section: Integers,
+    group: Places,
+    section: Places,
     command: Array,
     tables: Array,
     halves: Array,
@@ -210,7 +210,7 @@ def simulate_rows(  # noqa: C901 - one pass, kept whole so that nothing is store
         First piece of every row; the last entry is the number of pieces.
     row, length, edges, group, section : ndarray, shape (pieces,)
         Of every piece: its row; its length [s]; by how many shifts a lane's own is longer; its
-        transition in ``tables`` or -1; its column of ``command``.
+        transition in ``tables``, beyond them for none; its column of ``command``.
     command : ndarray, shape (lanes or 1, sections)
         Voltage [V] of every section.
     tables, halves : ndarray, shape (lanes, groups, 12)
@@ -299,13 +299,15 @@ def simulate_rows(  # noqa: C901 - one pass, kept whole so that nothing is store
 @compiled
 def _advance_in_motion(
     j: int, end: int, q: float, w: float, th: float, f: float, direction: float, te: float,
-    tm: float, k: float, be: float, group: Integers, section: Integers, row: Integers,
+    tm: float, k: float, be: float, group: Places, section: Places, row: Places,
     length: Array, edges: Integers, shift: float, voltage: Array, table: Array, out: Array,
     volts: Array,
 ) -> tuple[int, float, float, float]:  # fmt: skip
     """Advance through pieces up to an event of friction; return the next piece, q, w and th."""
     drives, speeds, angles = out[0], out[1], out[2]
-    for i in range(j, end):
+    group, section, row = group[j:end], section[j:end], row[j:end]
+    length, edges = length[j:end], edges[j:end]
+    for i in range(row.size):
         h = length[i] + edges[i] * shift
         if h > 0.0:
             v = voltage[section[i]]
@@ -314,7 +316,7 @@ def _advance_in_motion(
                 w1 * direction <= 0.0
                 or (te > 0.0 and (tm * w + h * (q - be * w - f)) * direction <= 0.0)
             ):
-                return i, q, w, th
+                return j + i, q, w, th
             q, w, th = q1, w1, th + turned
             if volts.shape[0] > 0:
                 volts[row[i]] += h * v
@@ -334,7 +336,7 @@ def _advance_piece(
     te: float, tm: float, k: float, be: float,
 ) -> tuple[float, float, float]:  # fmt: skip
     """Return q, w and the change of th after a piece, by its transition where it is tabulated."""
-    if kind < 0:
+    if kind >= table.shape[0]:
         return _propagate(q, w, h, v, f, te, tm, k, be)
     return _apply_transition(table, kind, q, w, v, f)
 

@@ -8,7 +8,7 @@ from functools import cached_property
 
 import numpy as np
 
-from smp_motor_control.arrays import Array, Integers
+from smp_motor_control.arrays import Array, Integers, Places
 from smp_motor_ident._compile import compiled
 
 MAX_CACHED_CUTS = 4
@@ -20,14 +20,17 @@ MAX_VARIED_LIKENESS = 0.9  # correlation of a command that varies within a perio
 
 @dataclass(frozen=True, eq=False)
 class Pieces:
-    """Intervals of constant input, row by row; see `simulate.kernel.simulate_rows`."""
+    """Intervals of constant input, row by row; see `simulate.kernel.simulate_rows`.
+
+    Places are unsigned: compiled code need not ask whether they count from the end.
+    """
 
     first: Integers  # shape (n + 1,)
     length: Array
     edges: Integers
-    row: Integers
-    group: Integers
-    section: Integers
+    row: Places
+    group: Places  # beyond the groups where its transition is not tabulated
+    section: Places
     grouped: Array  # shape (groups,): length of each group [s]
     grouped_edges: Integers
 
@@ -130,8 +133,9 @@ class Rows:
                 count = np.bincount(row, minlength=n)
         first = np.concatenate([[0], np.cumsum(count)])
         group, of = _group_pieces(length, edges, 10 * LENGTH_TOLERANCE * self.step)
-        row = np.repeat(np.arange(n), count)
-        return Pieces(first, length, edges, row, group, section, length[of], edges[of])
+        row = np.repeat(np.arange(n, dtype=np.uint32), count)
+        places = section.astype(np.uint32)
+        return Pieces(first, length, edges, row, group, places, length[of], edges[of])
 
     def _uncut(self) -> tuple[Integers, Array, Integers, Integers]:
         """Return what `_cut` does where every row is one section."""
@@ -184,9 +188,9 @@ def _cut_rows(
 
 
 @compiled
-def _group_pieces(length: Array, edges: Integers, quantum: float) -> tuple[Integers, Integers]:
-    """Return the group of every piece, -1 for none, and the first piece of every group."""
-    group = np.full(length.size, -1)
+def _group_pieces(length: Array, edges: Integers, quantum: float) -> tuple[Places, Integers]:
+    """Return the group of every piece, and the first piece of every group."""
+    group = np.full(length.size, MAX_LENGTH_GROUPS, dtype=np.uint32)
     kinds, first = np.empty(MAX_LENGTH_GROUPS), np.empty(MAX_LENGTH_GROUPS, dtype=np.int64)
     made = 0
     for j in range(length.size):
