@@ -11,16 +11,11 @@ import numpy as np
 
 from smp_motor_control.arrays import Array, Integers
 from smp_motor_ident._compile import compiled
-from smp_motor_ident.chain.component import (
-    MIN_SECOND_LAG_SHARE,
-    Parameter,
-    Scales,
-    Sensor,
-    Values,
-    compute_lags,
-)
+from smp_motor_ident.chain.component import Parameter, Scales, Sensor, Values, compute_lags
 from smp_motor_ident.simulate.motion import Motion
 from smp_motor_ident.simulate.rows import Rows
+
+MIN_EXCHANGED_LAG_SHARE = 0.05  # of the longer one
 
 
 class Speed(Sensor):
@@ -112,7 +107,7 @@ class LowPassedSpeed(Sensor):
         """
         lags, second = compute_lags(values)
         other = values.get("sensor_lag", second)
-        if other < MIN_SECOND_LAG_SHARE * lags:
+        if other < MIN_EXCHANGED_LAG_SHARE * lags:
             return {}
         ln_a1 = values["ln_a0"] + math.log(other)
         return {

@@ -398,10 +398,9 @@ def _fit_best_candidate(
     """Fit the promising candidates; return the best net gain and its fit."""
     best: tuple[float, Fit] | None = None
     promising = [c for c in screened[: policy.max_candidates] if c.gain > 0.5 * c.price]
-    alternatives = [*replace_second_lag(found, data), *(exchange_lags(found) if promising else ())]
     others = [
         Candidate(chain, one, math.nan, policy.price(one, 100.0))
-        for one, chain in alternatives
+        for one, chain in (*replace_second_lag(found, data), *exchange_lags(found))
         if with_alternatives and not found.chain.has(one.code)
     ]
     for candidate in (*promising, *others):
