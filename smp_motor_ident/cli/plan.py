@@ -70,8 +70,7 @@ def recordings(amplitude: float, duration: float) -> list[Recording]:
 def plan_extra_recording(estimates: Mapping[str, Estimate], amplitude: float) -> Recording | None:
     """Return the recording that would reduce the uncertainty of these estimates, or None.
 
-    It is needed while a quantity that gains depend on misses the required accuracy.  The wheel that
-    needs the longest recording decides.
+    The wheel that needs the longest recording decides.
     """
     proposals = [
         what_next(one, REQUIRED_ACCURACY, supply=amplitude, longest=MAX_EXTRA_S)
@@ -86,10 +85,9 @@ def plan_extra_recording(estimates: Mapping[str, Estimate], amplitude: float) ->
 
 
 def _is_uncertain(estimate: Estimate) -> bool:
-    known = {**estimate.parameters, **estimate.combinations}
-    names = ("dc_gain", "time_constant", "resistance", "motor_constant", "inertia")
-    given = (one for name in names if (one := known.get(name)) is not None and one.value)
-    return any((q.std or 0.0) > REQUIRED_ACCURACY * abs(q.value or 0.0) for q in given)
+    """Tell whether a quantity that gains depend on misses the required accuracy."""
+    both = (estimate.combinations.get(name) for name in ("dc_gain", "time_constant"))
+    return any(q and q.value and (q.std or 0.0) > REQUIRED_ACCURACY * abs(q.value) for q in both)
 
 
 class Schedule:
