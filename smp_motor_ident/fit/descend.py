@@ -36,11 +36,9 @@ MAX_STEPS = 30
 DEVIANCE_TOLERANCE = 1e-2  # a tenth of a standard deviation
 NEGLIGIBLE_GAIN = 0.1  # predicted gain over the tolerance, below which a step is not taken
 MAX_DAMPING = 100.0
-MAX_REUSE_COST_SHARE = 0.03  # predicted gain over cost up to which derivatives are reused
-MAX_REUSE_LOG_STEP = 0.2  # step of a logarithm up to which they are
-MAX_REUSE_GAIN_ERROR = 0.5  # relative error of the predicted gain up to which they are
+MAX_REUSE_GAIN_ERROR = 0.5  # relative error of the predicted gain up to which they are reused
 COST_ROUGHNESS = 3.0  # tolerances by which events and rounding make the cost uneven
-MAX_DERIVATIVE_DISTANCE = 0.1  # of a logarithm, from derivatives that a fit returns
+MAX_DERIVATIVE_DISTANCE = 0.1  # of a logarithm, up to which derivatives are reused
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,7 +120,7 @@ def descend(
             break
         fold = _find_longest_log_step(at, taken)
         place = data, trial, scales, update_initial_states(start, linear, taken), noise
-        near = 0 <= expected < MAX_REUSE_COST_SHARE * linear.cost and fold < MAX_REUSE_LOG_STEP
+        near = expected >= 0 and moved + fold < MAX_DERIVATIVE_DISTANCE
         following = _simulate_step(place, linear, near)
         gained = linear.cost - following.cost
         if _is_lower(following, linear):
@@ -142,8 +140,6 @@ def descend(
         elif expected < least:
             break
         linear, moved = linearise(data, at, scales, start, noise), 0.0
-    if moved > MAX_DERIVATIVE_DISTANCE:
-        linear = linearise(data, at, scales, start, noise)
     return Fit(at, scales, start, tuple(noise), linear, _compute_deviance(data, linear, noise))
 
 
