@@ -25,6 +25,7 @@ from smp_motor_ident.fit.descend import Fit
 
 BLOCK_COUNT = 24
 MAX_ROUNDING_RATIO = 1.1  # residual over an encoder's rounding up to which it is rounding
+MAX_ADEQUATE_SCATTER = 2.5  # between parts of a record, over chance
 MIN_SIGNIFICANT_EXCESS = 2.0  # standard deviations of a scatter beyond chance
 
 

@@ -27,7 +27,11 @@ from smp_motor_ident.chain.chain import Chain, respond
 from smp_motor_ident.chain.component import Component
 from smp_motor_ident.chain.sensor import Angle, DifferencedSpeed, LowPassedSpeed, Speed
 from smp_motor_ident.errors import CurrentError, InsufficientExcitationError
-from smp_motor_ident.fit.adequacy import compute_scatters, leaves_only_rounding
+from smp_motor_ident.fit.adequacy import (
+    MAX_ADEQUATE_SCATTER,
+    compute_scatters,
+    leaves_only_rounding,
+)
 from smp_motor_ident.fit.data import Data
 from smp_motor_ident.fit.descend import Fit, approach, descend, fit, fit_noises
 from smp_motor_ident.fit.linear import Linear
@@ -37,7 +41,6 @@ SEARCH_ORDER = 2
 """Order of the noise model during the search; a higher one would absorb missing components."""
 MIN_GAIN_RATIO = 0.3  # expected gain over that of the best fit; below it a component waits
 SEARCH_TOLERANCE = 0.3  # of the deviance, at which a fit of the search ends
-MAX_ADEQUATE_SCATTER = 2.0  # between parts of a record that a chain explains
 MIN_DEVIANCE_DIFFERENCE = 1.0  # between fits at different minima
 MIN_CORRELATION_SIGMAS = 4.0  # at which an autocorrelation differs from zero
 MAX_MEMORY_ROWS = 40  # of a residual, unless it repeats itself as a periodic command does
@@ -59,7 +62,6 @@ class SelectionPolicy:
     given: Mapping[str, float] = field(default_factory=dict)  # by the names of `catalogue.GIVEN`
     max_exchangeable: int = 4  # optional components up to which exchanges are tried
     extra_price: float = 6.0  # deviance: odds beyond even ones
-    max_scatter: float = 4.0  # between parts of a record; above it the search restarts
 
     def price(self, component: Component, variance_ratio: float) -> float:
         """Return the gain in deviance that a component must bring.
@@ -86,7 +88,7 @@ def search(data: Data, policy: SelectionPolicy | None = None, say: Say = lambda 
     """Return the fit of the chain that explains the data at the lowest price."""
     policy = policy or SelectionPolicy()
     found = _improve_chain(_fit_simplest(data, policy), data, policy, say)
-    if policy.restarts and measure_inadequacy(data, found) > policy.max_scatter:
+    if policy.restarts and measure_inadequacy(data, found) > MAX_ADEQUATE_SCATTER:
         for begun in _restart_with_component(found, data, policy, say):
             other = _improve_chain(begun, data, policy, say)
             if other.deviance < found.deviance - 20.0:

@@ -15,7 +15,7 @@ from smp_motor_ident.chain.component import Component, Parameter
 from smp_motor_ident.chain.quantities import REPORTED
 from smp_motor_ident.errors import CurrentError, InsufficientExcitationError, SignalError
 from smp_motor_ident.finding import Finding, format_figure
-from smp_motor_ident.fit.adequacy import Scatter, leaves_only_rounding
+from smp_motor_ident.fit.adequacy import MAX_ADEQUATE_SCATTER, Scatter, leaves_only_rounding
 from smp_motor_ident.fit.data import Data, prepare
 from smp_motor_ident.fit.descend import Fit, approach, fit
 from smp_motor_ident.fit.start import guess_motors
@@ -43,7 +43,6 @@ MIN_REST_NOISE_SHARE = 0.9  # of white noise in the motion of a motor at rest
 MIN_SIGNIFICANT_SIZE = 3.0  # standard deviations from which an effect is a warning
 UNREPORTED_PARAMETERS = ("current_offset", "vc", "eccentric_phase")
 """Parameters omitted from messages about their component."""
-MIN_REPORTED_SCATTER = 2.5  # between parts of a record, over chance
 MAX_NOTE_STD = 0.02  # relative, of a quantity up to which such a scatter is a note
 MAX_WARNING_STD = 0.2  # the same for a warning; above it a quantity is unreliable
 
@@ -182,7 +181,7 @@ def _check_fit(context: EstimateContext) -> Iterator[Finding]:
 def _check_disagreement(context: EstimateContext) -> Iterator[Finding]:
     """Report significantly different parameters in parts of a record."""
     worst = max(context.scatters, key=lambda s: s.ratio, default=None)
-    if worst is None or worst.ratio < MIN_REPORTED_SCATTER:
+    if worst is None or worst.ratio <= MAX_ADEQUATE_SCATTER:
         return
     spread = max(
         (q.std or 0.0) / abs(q.value or 1.0)
