@@ -60,7 +60,6 @@ class SelectionPolicy:
     restarts: bool = True  # whether to search again from other starts if inadequate
     first_order: bool = False  # whether the motor has no inductance
     given: Mapping[str, float] = field(default_factory=dict)  # by the names of `catalogue.GIVEN`
-    max_exchangeable: int = 4  # optional components up to which exchanges are tried
     extra_price: float = 6.0  # deviance: odds beyond even ones
 
     def price(self, component: Component, variance_ratio: float) -> float:
@@ -111,10 +110,8 @@ def _improve_chain(found: Fit, data: Data, policy: SelectionPolicy, say: Say) ->
     exchanged = False
     for _ in range(policy.max_rounds):
         better = _fit_best_addition(found, data, policy, say)
-        few = len(list(_list_optional_components(found, data))) <= policy.max_exchangeable
         if (
             better is None
-            and few
             and not exchanged
             and measure_inadequacy(data, found) > MAX_ADEQUATE_SCATTER
         ):
@@ -467,11 +464,7 @@ def _fit_best_exchange(found: Fit, data: Data, policy: SelectionPolicy, say: Say
         worth = compute_gain(data, bare.linear, found.linear.residual) - policy.price(one, 100.0)
         others = [c for c in screen_candidates(bare, data, policy) if c.component.code != one.code]
         other = _fit_best_candidate(bare, data, others, replace(policy, max_candidates=2), say)
-        if (
-            other is not None
-            and other[0] > worth + 2.0
-            and (best is None or other[0] - worth > best[0])
-        ):
+        if other is not None and other[0] - worth > (0.0 if best is None else best[0]):
             best = other[0] - worth, other[1]
     return None if best is None else _refit_noise(data, best[1])
 
