@@ -39,13 +39,11 @@ from smp_motor_ident.fit.start import guess_motors
 
 SEARCH_ORDER = 2
 """Order of the noise model during the search; a higher one would absorb missing components."""
-MIN_GAIN_RATIO = 0.3  # expected gain over that of the best fit; below it a component waits
 SEARCH_TOLERANCE = 0.3  # of the deviance, at which a fit of the search ends
 MIN_DEVIANCE_DIFFERENCE = 1.0  # between fits at different minima
 MIN_CORRELATION_SIGMAS = 4.0  # at which an autocorrelation differs from zero
 MAX_MEMORY_ROWS = 40  # of a residual, unless it repeats itself as a periodic command does
 MAX_ALTERNATIVE_COST_RATIO = 1.5  # of a chain without second lag of the motor to one with it
-MIN_CERTAIN_SIZE = 20.0  # standard deviations of a component that is kept without a test
 REQUIRED_COMPONENTS = ("friction", "asymmetric_friction")  # components that every motor has
 
 Say = Callable[[str], None]
@@ -403,8 +401,6 @@ def _fit_best_candidate(
         if with_alternatives and not found.chain.has(one.code)
     ]
     for candidate in (*promising, *others):
-        if best is not None and candidate.gain < MIN_GAIN_RATIO * best[0]:
-            continue  # the next round screens it again
         say(f"fitting {candidate.component.title}")
         fits = fit_roughly if candidate in promising else fit_alternative
         one = fits(data, candidate.chain, found)
@@ -474,8 +470,6 @@ def _drop_unneeded(found: Fit, data: Data, policy: SelectionPolicy) -> Fit:
     while True:
         best: tuple[float, Fit] | None = None
         for one, plainer in _list_optional_components(found, data):
-            if _standardise_size(found, one) > MIN_CERTAIN_SIZE:
-                continue
             bare = fit_roughly(data, plainer, found)
             net = policy.price(one, 100.0) - compute_gain(data, bare.linear, found.linear.residual)
             if net > 0 and (best is None or net > best[0]):
@@ -483,16 +477,6 @@ def _drop_unneeded(found: Fit, data: Data, policy: SelectionPolicy) -> Fit:
         if best is None:
             return found
         found = best[1]
-
-
-def _standardise_size(found: Fit, one: Component) -> float:
-    """Return a component's size over its standard deviation."""
-    p = next((p for p in one.parameters if p.name == one.linear and p.name in found.names), None)
-    if p is None:
-        return 0.0
-    k = found.names.index(p.name)
-    off = found.chain.values[p.name] - p.neutral * found.scales.of(p.unit)
-    return float(abs(off) / math.sqrt(found.covariance[k, k]))
 
 
 def prune(data: Data, found: Fit) -> Fit:
