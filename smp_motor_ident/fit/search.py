@@ -41,6 +41,7 @@ SEARCH_ORDER = 2
 """Order of the noise model during the search; a higher one would absorb missing components."""
 SEARCH_TOLERANCE = 0.3  # of the deviance, at which a fit of the search ends
 MIN_DEVIANCE_DIFFERENCE = 1.0  # between fits at different minima
+MIN_DEVIANCE_GAIN = 20.0  # of a chain, whatever its price
 MIN_CORRELATION_SIGMAS = 4.0  # at which an autocorrelation differs from zero
 MAX_MEMORY_ROWS = 40  # of a residual, unless it repeats itself as a periodic command does
 MAX_ALTERNATIVE_COST_RATIO = 1.5  # of a chain without second lag of the motor to one with it
@@ -88,7 +89,7 @@ def search(data: Data, policy: SelectionPolicy | None = None, say: Say = lambda 
     if policy.restarts and measure_inadequacy(data, found) > MAX_ADEQUATE_SCATTER:
         for begun in _restart_with_component(found, data, policy, say):
             other = _improve_chain(begun, data, policy, say)
-            if other.deviance < found.deviance - 20.0:
+            if other.deviance < found.deviance - MIN_DEVIANCE_GAIN:
                 found = other
     return found
 
@@ -385,7 +386,14 @@ def _refit_noise(data: Data, found: Fit) -> Fit:
 def _fit_best_addition(found: Fit, data: Data, policy: SelectionPolicy, say: Say) -> Fit | None:
     screened = screen_candidates(found, data, policy)
     best = _fit_best_candidate(found, data, screened, policy, say, with_alternatives=True)
-    return None if best is None or best[0] <= 0 else _refit_noise(data, best[1])
+    if best is None:
+        return None
+    other = _refit_noise(data, best[1])
+    if best[0] > 0:
+        return other
+    # The noise that was fitted to a misfit hides it; that of the other chain may not.
+    known = found.with_noise(data, other.noise).descend(data, SEARCH_TOLERANCE, 8)
+    return other if other.deviance < known.deviance - MIN_DEVIANCE_GAIN else None
 
 
 def _fit_best_candidate(
@@ -490,16 +498,14 @@ def prune(data: Data, found: Fit) -> Fit:
 
 
 def _is_negligible(data: Data, found: Fit, one: Component, plainer: Chain) -> bool:
-    """Tell whether a component is tiny, or explains no more than three deviations of its size."""
+    """Tell whether a component explains no more than three standard deviations of its size."""
     own = [p for p in one.parameters if p.name in found.names and p.name != "current_offset"]
     first = next(iter(own), None)
     if first is None:
         return False
     unit, k = found.scales.of(first.unit), found.names.index(first.name)
     off = abs(found.chain.values[first.name] - first.neutral * unit)
-    if off < 0.01 * first.typical * unit and one.slot != "current sensor":
-        return True
-    if one.severity == "note" or off > 3 * math.sqrt(found.covariance[k, k]):
+    if off > 3 * math.sqrt(found.covariance[k, k]):
         return False
     bare = fit_roughly(data, plainer, found)  # its derivative may be zero although it is needed
     return compute_gain(data, bare.linear, found.linear.residual) < 9.0
