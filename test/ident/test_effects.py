@@ -68,12 +68,12 @@ REAR_LEFT = TABLE_1["rear_left"]
 
 
 def low_pass_speed(
-    ratio: float, friction: float = 0.3, inductance: float = REAR_LEFT[1], levels: int = 0
+    ratio: float, friction: float = 0.3, inductance: float = REAR_LEFT[1], one_size: bool = False
 ) -> tuple[Record, float]:
     """Return a record of a speed behind a low-pass, and its lag [s]: a multiple of the motor's."""
     t = np.arange(3000) / 200
     steps = np.random.default_rng(2).uniform(-9.0, 9.0, 60)
-    voltage = np.repeat(8.5 * np.sign(steps) if levels == 2 else steps, 50)
+    voltage = np.repeat(8.5 * np.sign(steps) if one_size else steps, 50)
     r, _, k, j, b = REAR_LEFT
     speed = simulate(t, voltage, r, inductance, k, j, b, friction * k / r, 0 * t, 10)[:, 1]
     lag = ratio * motors.truth("rear_left", friction)["time_constant"]
@@ -93,7 +93,7 @@ def test_low_pass_of_the_speed_is_told_from_the_motor_by_friction(ratio):
 
 
 def test_low_pass_of_the_speed_is_told_from_the_motor_where_nothing_else_is_promising():
-    record, lag = low_pass_speed(4.0, inductance=1e-3, levels=2)
+    record, lag = low_pass_speed(4.0, inductance=1e-3, one_size=True)
     found = estimate(record)
     assert found.chain.values["sensor_lag"] == pytest.approx(lag, rel=0.02)
     motors.check(found, motors.truth("rear_left", 0.3), ["static_voltage"])
