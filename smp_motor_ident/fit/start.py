@@ -27,6 +27,7 @@ DELAYS = (0.0, 1.0, 3.0)  # rows
 LONG_DELAYS = (10.0, 20.0, 40.0, 80.0, 160.0, 320.0)  # rows
 MAX_GOOD_COST = 0.1  # unexplained share of the output; above it long delays are tried
 MAX_GRID_ROWS = 2000
+MIN_VIEW_ROWS = 4  # of a segment
 MIN_LOG_DISTANCE = 0.5  # between two starts
 
 
@@ -80,7 +81,8 @@ def select_views(data: Data) -> Iterator[Data]:
     first = max(int(np.searchsorted(rows.time[: rows.segment[1]], begin)) - 5, 0)
     last = min(first + MAX_GRID_ROWS, int(rows.segment[1]))
     held = rows.mean_command
-    yield _replace_rows(data, rows.time[first:last], held[first:last], data.motion[first:last])
+    if last - first >= MIN_VIEW_ROWS:
+        yield _replace_rows(data, rows.time[first:last], held[first:last], data.motion[first:last])
     every = -(-len(data) // MAX_GRID_ROWS)
     if every > 1 or rows.segment.size > 2:
         yield _average_rows(data, held, every)
@@ -112,7 +114,7 @@ def _average_rows(data: Data, held: Array, every: int) -> Data:
     times, commands, outputs, starts = [], [], [], [0]
     for a, b in pairwise(rows.segment):
         k = np.arange(a, b, every)
-        if k.size < 4:
+        if k.size < MIN_VIEW_ROWS:
             continue
         put = np.concatenate([[0.0], np.cumsum((held * rows.interval)[a + 1 : b])])[k - a]
         mean = np.diff(put, prepend=0.0) / np.diff(rows.time[k], prepend=-np.inf)

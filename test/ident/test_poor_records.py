@@ -414,3 +414,11 @@ def test_speed_quantum_is_found_despite_uneven_rounding_of_the_log(sign):
     speed = simulate_logged_step(sign * 8.1).velocity
     # A line through 36 levels, each out by half a unit, is out by far less than a unit.
     assert speed_quantum(speed) == pytest.approx(31.25 * UNIT, rel=0.005)
+
+
+def test_first_segment_of_one_row_does_not_prevent_an_estimate():
+    record = motors.record("rear_left", current=False)
+    time = record.time.copy()
+    time[1:] += 1.0  # the log lost a second after its first row
+    found = estimate(replace(record, time=time, starts=(0, 1)))
+    motors.check(found, motors.truth("rear_left", 0.3), ("dc_gain", "static_voltage"))
